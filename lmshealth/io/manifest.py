@@ -4,6 +4,7 @@ A bad row of a table next to logs is refused alone; a bad cell of a table of est
 refuses the table. Both are named by their line.
 """
 
+import codecs
 import csv
 import io
 import os
@@ -39,6 +40,7 @@ if TYPE_CHECKING:
 
 
 _MOST_LISTED = 3
+_DELIMITERS = ",;\t"
 MISSPELT = "unlike-key"  # reason of a column of a manifest that is probably misspelt
 _LIKE = 0.75  # likeness of words (difflib) from which one is taken for a misspelt other
 
@@ -56,8 +58,9 @@ class Row(NamedTuple):
 
 
 def read_sheet(path: Path, needed: Sequence[str]) -> Iterator[Row]:
-    """Read a table of comma-separated values row by row, after a header line.
+    """Read a table row by row, after a header line, whose most frequent delimiter separates all.
 
+    Commas, semicolons or tabs in UTF-8, or in UTF-16 with its mark, as spreadsheets write them.
     `Unusable`: ``missing-file``, ``too-large``, ``empty``, and ``columns`` where a needed one is
     missing, or any is there twice.
     """
@@ -69,14 +72,19 @@ def read_sheet(path: Path, needed: Sequence[str]) -> Iterator[Row]:
         raise Unusable("too-large", f"{error}; split it") from error
     if (n_rows := content.count(b"\n") + content.count(b"\r")) > constants.MOST_ROWS:
         raise Unusable("too-large", f"{n_rows} lines, allowed are {constants.MOST_ROWS}; split it")
-    text = content.decode("utf-8-sig", "surrogateescape")
-    records = _records(io.StringIO(text, newline=None).readlines())
+    if content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
+        text = content.decode("utf-16", "replace")
+    else:
+        text = content.decode("utf-8-sig", "surrogateescape")
+    rows = io.StringIO(text, newline=None).readlines()
+    header = next(filter(str.strip, rows), "")
+    records = _records(rows, max(_DELIMITERS, key=header.count))
     names = [name.strip() for name in next(records, ("", [], ""))[1]]
     if not names:
         raise Unusable("empty", f"no header line; needed {listed(needed)}")
     wide = len(names) > constants.MOST_CELLS
     if wide or repeated(filter(None, names)) or not set(needed) <= set(names):
-        detail = f"needed {listed(needed)}, none twice, and commas between"
+        detail = f"needed {listed(needed)}, none twice, with commas, semicolons or tabs between"
         raise Unusable("columns", f"columns are {listed(names)}; {detail}")
     for where, cells, trouble in records:
         stripped = [cell.strip() for cell in cells]
@@ -86,18 +94,18 @@ def read_sheet(path: Path, needed: Sequence[str]) -> Iterator[Row]:
         yield Row(where, padded, trouble)
 
 
-def _records(lines: list[str]) -> Iterator[tuple[str, list[str], str]]:
+def _records(lines: list[str], delimiter: str) -> Iterator[tuple[str, list[str], str]]:
     """Yield place, cells and trouble of each record."""
     # A new reader starts at the line after every record: an open quote would else include all
     # rows up to the next one without an error.
     at = 0
     while at < len(lines):
         some = lines[at : at + constants.LONGEST_CELL]
-        reader = csv.reader(some, strict=True, skipinitialspace=True)
+        reader = csv.reader(some, delimiter=delimiter, strict=True, skipinitialspace=True)
         try:
             cells, n, trouble = next(reader), reader.line_num, ""
         except csv.Error as error:
-            cells, n, trouble = lines[at].split(","), 1, f"no row of a table: {error}"
+            cells, n, trouble = lines[at].split(delimiter), 1, f"no row of a table: {error}"
         where = f"line {at + 1}" if n == 1 else f"lines {at + 1} to {at + n}"
         at += n
         if cells:

@@ -996,8 +996,8 @@ def test_a_table_that_cannot_be_read_is_named_before_the_logs(
     logs = tmp_path / "logs"
     logs.mkdir()
     (logs / "one.csv").write_text("# sample_rate_hz: 1000\nacc_pitch_m_s2\n0\n1\n0\n")
-    (logs / "manifest.csv").write_text("file;stage;travel_km\none.csv;axis-7;0\n")
-    with pytest.raises(NothingUsable, match=r"log: manifest\.csv: columns are file;stage"):
+    (logs / "manifest.csv").write_text("file|stage|travel_km\none.csv|axis-7|0\n")
+    with pytest.raises(NothingUsable, match=r"log: manifest\.csv: columns are file\|stage"):
         run(logs, [modes_only], tmp_path / "out")
 
 

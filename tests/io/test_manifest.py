@@ -63,6 +63,29 @@ def test_manifest_overrides(make, tmp_path):
     assert manifest.refused == () and manifest.overrides(tmp_path / "other.csv") == {}
 
 
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "utf-16"])
+@pytest.mark.parametrize("delimiter", [",", ";", "\t"])
+def test_manifests_as_spreadsheets_write_them(make, tmp_path, delimiter, encoding):
+    """Semicolons where the decimal mark is a comma, tabs in UTF-16; cells may have other marks."""
+    path, other = make("größe.csv"), make("two.csv")
+    rows = ["file,stage,travel_km,remark", "größe.csv,A,1.5,", "two.csv,B,2,one more"]
+    text = "\r\n".join(rows).replace(",", delimiter) + (" or" if delimiter == "," else ", or")
+    (tmp_path / "manifest.csv").write_bytes(text.encode(encoding))
+    manifest = read_manifest(tmp_path)
+    assert manifest.overrides(path) == {"stage": "A", "travel_km": "1.5"}
+    assert read_log(path, overrides=manifest.overrides(path)).metadata.travel == 1500.0
+    assert manifest.overrides(other)["stage"] == "B"
+
+
+def test_a_number_with_a_decimal_comma_is_quoted(make, tmp_path):
+    """It is not known whether 1,234 is more than one: the log is refused, its row quoted."""
+    path = make("log.csv")
+    (tmp_path / "manifest.csv").write_text("file;stage;travel_km\nlog.csv;A;1,234\n")
+    with pytest.raises(BadLog, match=r"travel_km.*1,234") as caught:
+        read_log(path, overrides=read_manifest(tmp_path).overrides(path))
+    assert caught.value.reason == "metadata"
+
+
 def test_a_misspelt_column_is_noticed(make, tmp_path):
     """It is quoted with the nearest key; columns of the user's own, and known ones, are not."""
     make("log.csv")
@@ -116,8 +139,8 @@ def test_rows_without_log(tmp_path):
         (b"", "empty"),
         (b"stage\nA\n", "columns"),
         (b"file,file\na,b\n", "columns"),
-        (b"file;stage\na;b\n", "columns"),
-        ("file,stage\na,b\n".encode("utf-16"), "columns"),
+        (b"file stage\na b\n", "columns"),
+        ("file,stage\na,b\n".encode("utf-16-le"), "columns"),  # without its mark
     ],
 )
 def test_manifests_that_say_nothing(tmp_path, text, reason):

@@ -110,6 +110,14 @@ def test_a_bad_row_below_a_folder_costs_no_other_row(tmp_path: Path) -> None:
     assert {u.refusal.log for u in found.unread} == {"deep/maintenance.csv"}
 
 
+def test_a_table_with_semicolons_is_read(tmp_path: Path) -> None:
+    """As spreadsheets write it where the decimal mark is a comma."""
+    text = (HEAD + "A,2026-05-01T09:00:00Z,servo\n").replace(",", ";")
+    (tmp_path / "maintenance.csv").write_text(text, encoding="utf-16")
+    (action,) = read_maintenance(tmp_path).actions
+    assert (action.stage, action.action) == ("A", "servo")
+
+
 def test_what_is_not_understood_is_told_to_the_machine_it_names(tmp_path: Path) -> None:
     """The note is for the machine of the row, and for all machines if a table is unreadable."""
     (tmp_path / "maintenance.csv").write_text(HEAD + "A,2026-05-01T09:00:00Z,repainted\n")
@@ -117,10 +125,10 @@ def test_what_is_not_understood_is_told_to_the_machine_it_names(tmp_path: Path) 
     (note,) = maintenance_notices(work.of("A"), MOMENTS)
     assert "line 2: action 'repainted' is unknown" in note.what
     assert work.of("B") == Maintenance()
-    (tmp_path / "maintenance.csv").write_text("stage;recorded_at;action\n")
+    (tmp_path / "maintenance.csv").write_text("stage|recorded_at|action\n")
     for machine in ("A", "B"):
         (note,) = maintenance_notices(read_maintenance(tmp_path).of(machine), MOMENTS)
-        assert "columns are stage;recorded_at;action" in note.what
+        assert "columns are stage|recorded_at|action" in note.what
 
 
 def test_maintenance_out_of_the_folder_is_not_read(tmp_path: Path) -> None:
