@@ -164,6 +164,16 @@ def test_the_magnitude_of_other_channels_is_found():
     assert magnitudes([x, other, y, z], [(0, N)]) == {}
 
 
+def test_magnitudes_are_found_among_many_channels():
+    """Two of them, which have an axis in common, exact or rounded, with an offset or without."""
+    rng = np.random.default_rng(12)
+    axes = rng.standard_normal((40, N)) * np.geomspace(0.5, 2, 40)[:, None]
+    first, second = (np.sqrt(np.sum(axes[own] ** 2, axis=0)) for own in ([3, 8, 21], [8, 30]))
+    found = magnitudes([*axes, first - 9.81, np.round(second, 3)], [(0, N)])
+    assert found == {40: [3, 8, 21], 41: [8, 30]}
+    assert magnitudes([*axes, first + 0.3 * axes[1], second * axes[0]], [(0, N)]) == {}
+
+
 def test_levels():
     """A third of a step and a stuck bit are noted; a stuck last bit only doubles the step."""
     x = vibration()
