@@ -354,6 +354,8 @@ class LogSpectra:
 
     def select(self, kept: Sequence[int]) -> Self:
         """Return some of the channels."""
+        if [*kept] == [*range(len(self.channels))]:  # a copy would be as large as the log
+            return self
         spectra = tuple(
             replace(
                 s,
