@@ -64,8 +64,8 @@ NOT_MET = {
         "few channels at a time"
     ),
     "time": (
-        "a search of all frequencies of 256 channels: eight channels at a time in five bands, twice "
-        "where a line is suspected, a second each; a band that is searched keeps within it"
+        "a search of all frequencies of 256 channels: eight channels at a time in five bands, "
+        "twice where a line is suspected, a second each; a band that is searched keeps within it"
     ),
 }
 
