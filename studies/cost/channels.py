@@ -59,13 +59,14 @@ OPTIONS = {
 SEED = 20261126
 NOT_MET = {
     "memory": (
-        "searches of 60 s of eight channels, or 20 s of 64, at 20 kHz: spectra, their copy without "
-        "lines and the power of all ordinates take 0.2 GB each; sinusoids are to be removed from a "
-        "few channels at a time"
+        "a search of all frequencies of 64 channels at 20 kHz: spectra, their copy without lines "
+        "and the power of all ordinates take 0.1 to 0.2 GB each; sinusoids are to be removed from "
+        "a few channels at a time"
     ),
     "time": (
-        "a search of all frequencies of 256 channels: eight channels at a time in five bands, "
-        "twice where a line is suspected, a second each; a band that is searched keeps within it"
+        "searches of all frequencies of 256 channels, and of 64 at 20 kHz: eight channels at a "
+        "time in all bands, twice where a line is suspected, up to a second each; a band that is "
+        "described keeps within it"
     ),
 }
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TypeVar
 
 import numpy as np
 from scipy.linalg import block_diag
@@ -13,8 +12,6 @@ from scipy.linalg import block_diag
 from lmshealth._private.arrays import BoolArray, ComplexArray, FloatArray
 from lmshealth.modal import constants
 from lmshealth.modal.ambient.whittle import receptance, response
-
-T = TypeVar("T", np.float64, np.complex128)
 
 # Gain in log likelihood below which a mode is left as it is, and most shorter steps.
 _LEAST_GAIN, _HALVINGS = 0.3, 5
