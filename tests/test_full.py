@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 from studies.harness import full, provenance
+from tests.test_resume import CACHES
 
 STUDY = '''"""Is this fake study run?"""
 
@@ -85,7 +86,7 @@ def test_all_are_recorded_and_failures_are_named(
 
 def forget() -> None:
     """Forget what was known of all code."""
-    for known in (provenance._digest, provenance._tree, provenance._statements):
+    for known in CACHES:
         known.cache_clear()
 
 

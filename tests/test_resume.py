@@ -38,6 +38,7 @@ def outcomes(rows):
     return len(rows)
 '''
 TASKS = [("a", k) for k in range(5)] + [("b", 0)]
+CACHES = provenance._digest, provenance._tree, provenance._statements, provenance._meaning
 
 
 @pytest.fixture
@@ -45,7 +46,7 @@ def written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
     """Write a script as a module, and forget what was known of all code."""
 
     def forget() -> None:
-        for known in (provenance._digest, provenance._tree, provenance._statements):
+        for known in CACHES:
             known.cache_clear()
 
     def write(text: str) -> ModuleType:
@@ -192,6 +193,36 @@ def test_code_that_is_reached_counts(
     monkeypatch.setattr(Path, "read_text", other)
     assert (provenance.code_of(script.draw) != before) == counts
     assert changed
+
+
+@pytest.mark.parametrize(
+    ("first", "second", "same"),
+    [("lives", "check", True), ("constants", "check", True), ("check", "lives", False)],
+)
+def test_a_definition_counts_wherever_it_is(
+    written: Any, monkeypatch: pytest.MonkeyPatch, first: str, second: str, same: bool
+) -> None:
+    """Trials stay valid where a definition moves; not where two of one name change places."""
+    signs = {"lives": "", "constants": "", "check": "-"}
+    read, uses = Path.read_text, "place.__name__, first(1), second(1)"
+
+    def other(path: Path, *words: Any, **named: Any) -> str:
+        sign = signs.get(path.stem) if path.parent.name == "calibration" else None
+        more = "" if sign is None else f"def sign(x):\n    return {sign}x\n"
+        return f"{read(path, *words, **named)}\n{more}"
+
+    def code(first: str, second: str) -> str:
+        script = written(SCRIPT)
+        imports = [
+            f"from lmshealth.calibration.{home} import sign as {name}\n"
+            for name, home in (("first", first), ("second", second))
+        ]
+        text = "".join(imports) + SCRIPT.replace("SCALE *", f"({uses}) and SCALE *")
+        Path(script.__file__).write_text(text)
+        return provenance.code_of(script.draw)
+
+    monkeypatch.setattr(Path, "read_text", other)
+    assert (code(first, second) == code("lives", "check")) == same
 
 
 def test_tables_that_are_read_count(written: Any, monkeypatch: pytest.MonkeyPatch) -> None:

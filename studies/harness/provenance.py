@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import copy
 import hashlib
 import os
 import platform
@@ -33,6 +34,8 @@ _PROGRAMS = ("lmshealth/cli/*.py", "models/__main__.py")
 _HARMLESS = {"cache", "contextmanager", "dataclass", "lru_cache", "overload"}
 # Those that change run times alone.
 _NO_VALUE = {"one_thread"}
+# Reasons why a figure is not met: no value depends on them.
+_WORDS = {"NOT_MET"}
 # The package itself gathers names of all its modules: of it a trial needs those that it names.
 _GATHERING = PROJECT / "lmshealth" / "__init__.py"
 
@@ -76,7 +79,8 @@ def code_of(work: Callable[..., Any], also: tuple[str, ...] = ()) -> str:
     This is the function with the functions, classes and constants of the project that it names,
     directly or not, what modules run when they are imported for it, the tables and descriptions
     whose file or folder this code names, and the versions of libraries. Comments, docstrings,
-    layout, threads and code that it does not reach do not count.
+    layout, threads, code that it does not reach, and the module in which a definition stands do
+    not count: what a name is, does.
     """
     return _digest(_script(work), bare(work).__qualname__, also)
 
@@ -95,11 +99,8 @@ def _digest(path: Path, name: str, also: tuple[str, ...]) -> str:
     files = (_file(module.split(".")) for module in also)
     needed = _needed({(path, name)} | {(file, _ALL) for file in files if file is not None})
     total = hashlib.sha256(" ".join(version(library) for library in _LIBRARIES).encode())
-    for module in sorted(needed):
-        # A script is known by what it does, wherever it is.
-        total.update(b"" if module == path else module.relative_to(PROJECT).as_posix().encode())
-        total.update("".join(needed[module]).encode())
-    code = "".join(one for codes in needed.values() for one in codes)
+    code = "".join(sorted(set().union(*needed.values())))
+    total.update(code.encode())
     for part in _tables(code):
         total.update(part)
     return total.hexdigest()[:16]
@@ -140,8 +141,11 @@ def _is_text(statement: ast.stmt) -> bool:
     return isinstance(value, ast.Constant) and isinstance(value.value, str)
 
 
-def _needed(parts: set[_Part]) -> dict[Path, list[str]]:
-    """Return, by module, what parts of modules need of the project, in an order of its own."""
+def _needed(parts: set[_Part]) -> dict[Path, set[str]]:
+    """Return, by module, the code that parts of modules need of the project.
+
+    With each statement is what the names in it are.
+    """
     found: dict[Path, set[str]] = {}
     seen, left = set[_Part](), list(parts)
     while left:
@@ -151,14 +155,29 @@ def _needed(parts: set[_Part]) -> dict[Path, list[str]]:
         if part in seen or part == (_GATHERING, _RUN) or module == _HERE or not module.exists():
             continue
         seen.add(part)
+        if name in _WORDS:
+            continue
         if module not in found:
             found[module] = set()
             # Whoever imports from a package runs all that it begins with, and what this imports.
             left += [(module.parent / "__init__.py", _RUN), (module, _RUN)]
         for code, needs in _statements(module).get(name, ()):
-            found[module] |= {code} - {""}
+            if code:
+                found[module].add(f"{code} {' '.join(sorted(map(_meaning, needs)))}")
             left += needs
-    return {module: sorted(codes) for module, codes in found.items() if codes}
+    return {module: codes for module, codes in found.items() if codes}
+
+
+@cache
+def _meaning(part: _Part) -> str:
+    """Return a name with the digest of its definition, wherever that is; empty if it has none."""
+    module, name = part
+    if name in (_ALL, _RUN) or not module.exists():
+        return ""
+    rows = _statements(module).get(name, ())
+    # A name that is imported is what its definition is.
+    codes = sorted(code or "".join(map(_meaning, needs)) for code, needs in rows)
+    return f"{name}:{hashlib.sha256(''.join(codes).encode()).hexdigest()[:16]}" if codes else ""
 
 
 @cache
@@ -178,10 +197,19 @@ def _statements(module: Path) -> dict[str, list[tuple[str, set[_Part]]]]:
         names = _defined(statement)
         if test != "TYPE_CHECKING" and (not names or _registers(statement)):
             names.add(_RUN)
-        row = ast.dump(statement), _uses(module, statement, origins)
+        row = _dump(statement), _uses(module, statement, origins)
         for name in {*names, _ALL}:
             found[name].append(row)
     return dict(found)
+
+
+def _dump(statement: ast.stmt) -> str:
+    """Return the code of a statement, without the modules of the project that it names."""
+    statement = copy.deepcopy(statement)
+    for node in ast.walk(statement):
+        if isinstance(node, ast.ImportFrom) and (node.module or "").split(".")[0] in _PACKAGES:
+            node.module = None
+    return ast.dump(statement)
 
 
 def _uses(module: Path, statement: ast.stmt, origins: _Origins) -> set[_Part]:
@@ -224,19 +252,21 @@ def _defined(statement: ast.stmt) -> set[str]:
 
 
 def _origins(nodes: Iterable[ast.AST]) -> _Origins:
-    """Return what names are imported as: the code, and the part of the project if it is one."""
+    """Return what names are imported as: the part of the project, or the code of any other."""
     found: _Origins = {}
     for node in nodes:
         if isinstance(node, ast.Import):
             for alias in node.names:
                 file = _file(alias.name.split("."))
                 part = (file, _ALL) if file else None
-                found[alias.asname or alias.name.split(".")[0]] = ast.dump(alias), part
+                code = "" if part else ast.dump(alias)
+                found[alias.asname or alias.name.split(".")[0]] = code, part
         elif isinstance(node, ast.ImportFrom):
             package = (node.module or "").split(".")
             for alias in node.names:
-                code = f"{node.module} {ast.dump(alias)}"
-                found[alias.asname or alias.name] = code, _source(package, alias.name)
+                part = _source(package, alias.name)
+                code = "" if part else f"{node.module} {ast.dump(alias)}"
+                found[alias.asname or alias.name] = code, part
     return found
 
 
