@@ -33,13 +33,7 @@ from lmshealth.tracking.history import (
     doubt_of_clock,
     missing_mode_notices,
 )
-from lmshealth.tracking.maintenance import (
-    NO_MAINTENANCE,
-    Maintenance,
-    maintenance_notices,
-    read_actions,
-    restored,
-)
+from lmshealth.tracking.maintenance import Maintenance, maintenance_notices, read_work, restored
 from lmshealth.tracking.read_tables import has_drifts, read_drifts, read_machines
 from lmshealth.tracking.track import accepted_estimates, outlier_refusals, smooth
 from lmshealth.tracking.track import track as track_modes
@@ -79,7 +73,7 @@ def track(ctx: click.Context, /, table: Path, **given: Any) -> None:
     without --stage every covariate column is regressed about its median.
     """
     stage, targets = given["stage"], given | {"track": given["out"]}
-    machines, notes = read_machines(table, stage, **_reading(given))
+    machines, notes, _ = _read(table, given)
     rows: dict[str, list[Row]] = {name: [] for name in _TABLES}
     tracked = []
     with progress_bars(PATIENCE) as progress:
@@ -109,9 +103,11 @@ def _some_left_out(machines: Sequence[Machine]) -> bool:
     return any(one.reason in LEFT_OUT for _, refused in machines for one in refused)
 
 
-def _reading(given: dict[str, Any]) -> dict[str, Any]:
-    names = {"cross_terms": "cov", "maintenance": "maintenance", "latest": "latest"}
-    return {name: given[option] for name, option in names.items()}
+def _read(table: Path, given: dict[str, Any]) -> tuple[list[Machine], list[str], Maintenance]:
+    """Read the machines of a table of estimates, notes on them, and the maintenance of all."""
+    latest, work = given["latest"], read_work(given["maintenance"], given["latest"])
+    how = {"cross_terms": given["cov"], "work": work, "latest": latest}
+    return *read_machines(table, given["stage"], **how), work
 
 
 def _notes(history: History, refused: list[Refusal]) -> list[str]:
@@ -156,7 +152,7 @@ def infer(ctx: click.Context, /, table: Path, **given: Any) -> None:
         if has_drifts(table):
             found, lost = _infer_drifts(table, given, progress)
         else:
-            machines = _machines(table, given)
+            machines, _ = _machines(table, given)
             lives, lost = _lives(machines, given, progress)
             found = []
             for history, life in lives:
@@ -197,11 +193,10 @@ def _infer_drifts(
     return found, lost
 
 
-def _machines(table: Path, given: dict[str, Any]) -> list[Machine]:
-    """Read the machines of a table of estimates, and print what it lacks."""
-    machines, notes = read_machines(table, given["stage"], **_reading(given))
+def _machines(table: Path, given: dict[str, Any]) -> tuple[list[Machine], Maintenance]:
+    """Read machines and their maintenance, and print what the table of estimates lacks."""
+    machines, notes, work = _read(table, given)
     print_notes(notes)
-    work = _work(given)
     for history, refused in machines:
         found = maintenance_notices(work.of(history.stage), history.recorded_at)
         found += missing_mode_notices(history, refused)
@@ -209,12 +204,7 @@ def _machines(table: Path, given: dict[str, Any]) -> list[Machine]:
         found += covariate_notices(history.covariates, given["stage"])
         # What is serious is printed as the reason why there is no life.
         print_notes(f"{history.stage}: {one}" for one in found if one.severity != "serious")
-    return machines
-
-
-def _work(given: dict[str, Any]) -> Maintenance:
-    path = given["maintenance"]
-    return Maintenance(read_actions(path, given["latest"])) if path else NO_MAINTENANCE
+    return machines, work
 
 
 @options.command(
@@ -256,7 +246,7 @@ def prognose(ctx: click.Context, /, table: Path, **given: Any) -> None:
     stage, by = given["stage"], given["by"]
     decision = _decision(stage.description.decision, given["max_risk"], given["cost_ratio"])
     with progress_bars(PATIENCE) as progress:
-        machines = _machines(table, given)
+        machines, work = _machines(table, given)
         lives, lost = _lives(machines, given, progress)
     found, rows = [], []
     for history, posterior in lives:
@@ -264,7 +254,7 @@ def prognose(ctx: click.Context, /, table: Path, **given: Any) -> None:
             found.append((prognosis_of(posterior, history, stage), posterior))
         except NotEnoughData as why:
             lost.append(str(why))
-    words, work = {one.name: one.word for one in stage.parameters}, _work(given)
+    words = {one.name: one.word for one in stage.parameters}
     for prognosis, _ in found:
         done = work.of(prognosis.stage).since(prognosis.recorded_at)
         left = without_limits(prognosis, restored(words, done))

@@ -94,12 +94,12 @@ def read_maintenance(
     )
 
 
-def read_actions(path: Path, latest: datetime | None = None) -> tuple[Action, ...]:
-    """Read one table of maintenance, or raise `BadTable` if any row cannot be read."""
-    work = _read([(path, shown(path))], latest)
+def read_work(path: Path | None, latest: datetime | None = None) -> Maintenance:
+    """Read one table of maintenance, if any, or raise `BadTable` if a row cannot be read."""
+    work = _read([] if path is None else [(path, shown(path))], latest)
     for one in work.unread:
         raise BadTable(f"{one.refusal.log}, {one.refusal.detail}")
-    return work.actions
+    return work
 
 
 def _read(tables: Iterable[tuple[Path, str]], latest: datetime | None) -> Maintenance:

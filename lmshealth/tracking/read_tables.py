@@ -24,7 +24,7 @@ from lmshealth.modal.modes import Modes
 from lmshealth.stage.description import Stage
 from lmshealth.tracking import constants
 from lmshealth.tracking.history import History, build_history
-from lmshealth.tracking.maintenance import read_actions, without_logs
+from lmshealth.tracking.maintenance import NO_MAINTENANCE, Maintenance, without_logs
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -128,25 +128,24 @@ def read_machines(
     stage: Stage | None = None,
     *,
     cross_terms: Path | None = None,
-    maintenance: Path | None = None,
+    work: Maintenance = NO_MAINTENANCE,
     latest: datetime | None = None,
 ) -> tuple[list[tuple[History, list[Refusal]]], list[str]]:
     """Read a table in the columns of ``modes.csv``: a history per machine, with its refusals.
 
-    Parameters are those of `read_estimates`, and a table of `maintenance`; a ``modes_cov.csv`` in
-    the same folder has the cross terms if none are given. Raises `BadTable` as `read_estimates`.
+    Parameters are those of `read_estimates`, and the maintenance of all machines; a
+    ``modes_cov.csv`` in the same folder has the cross terms if none are given. Raises `BadTable` as
+    `read_estimates`.
     """
     default = path.with_name("modes_cov.csv")
     terms = cross_terms or (default if default.exists() else None)
     logs, notes = read_estimates(path, cross_terms=terms, stage=stage, latest=latest)
-    actions = read_actions(maintenance, latest) if maintenance else ()
     own: dict[str, list[LogEstimates]] = {}
     for one in logs:
         own.setdefault(str(one.metadata.stage), []).append(one)
-    notes += without_logs(actions, own)
+    notes += without_logs(work.actions, own)
     machines = [
-        build_history(estimates, stage, [action for action in actions if action.stage == name])
-        for name, estimates in own.items()
+        build_history(estimates, stage, work.of(name).actions) for name, estimates in own.items()
     ]
     return machines, notes
 

@@ -15,8 +15,8 @@ from lmshealth.tracking.maintenance import (
     Action,
     Maintenance,
     maintenance_notices,
-    read_actions,
     read_maintenance,
+    read_work,
 )
 from tests.lives import START
 
@@ -45,7 +45,7 @@ def test_rows_of_a_table_are_put_in_the_order_of_time(tmp_path: Path) -> None:
     path = tmp_path / "maintenance.csv"
     rows = ["A,2026-05-02T09:00:00Z,servo", "B,2026-05-01T09:00:00Z,regrease"]
     path.write_text(HEAD + "\n".join([*rows, "A,2026-05-01T10:00:00+02:00,servo\n"]))
-    found = [(action.stage, action.recorded_at.day) for action in read_actions(path)]
+    found = [(action.stage, action.recorded_at.day) for action in read_work(path).actions]
     assert found == [("A", 1), ("B", 1), ("A", 2)]
 
 
@@ -72,7 +72,7 @@ def test_a_table_that_is_named_is_refused_for_any_row(
     path = tmp_path / "maintenance.csv"
     path.write_text(text)
     with pytest.raises(BadTable, match=needle) as caught:
-        read_actions(path)
+        read_work(path)
     assert "maintenance.csv" in str(caught.value)
     (one,) = read_maintenance(tmp_path).unread
     assert one.refusal.log == "maintenance.csv"

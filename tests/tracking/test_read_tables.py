@@ -17,6 +17,7 @@ from lmshealth.modal.log_estimates import LogEstimates
 from lmshealth.report.tables import csv_text, track_tables
 from lmshealth.stage.description import Stage
 from lmshealth.tracking.history import build_history
+from lmshealth.tracking.maintenance import read_work
 from lmshealth.tracking.read_tables import read_drifts, read_estimates, read_machines
 from tests.lives import FADING, make_stage, make_track
 
@@ -123,11 +124,9 @@ def test_logs_of_the_future_are_refused_unless_allowed(tmp_path: Path) -> None:
         read_machines(path)
     work = tmp_path / "maintenance.csv"
     work.write_text(f"stage,recorded_at,action\nAX-1,{late},servo\n")
-    now = tmp_path / "now.csv"
-    now.write_text(HEAD + row())
     with pytest.raises(BadTable, match=r"maintenance.csv, line 2: recorded_at is '2062-"):
-        read_machines(now, maintenance=work)
-    ((history, _),), _ = read_machines(path, latest=LAST_MOMENT, maintenance=work)
+        read_work(work)
+    ((history, _),), _ = read_machines(path, latest=LAST_MOMENT, work=read_work(work, LAST_MOMENT))
     assert history.recorded_at[0].year == 2062
     drifts = tmp_path / "track.csv"
     drifts.write_text(DRIFT_HEAD + drift_row().replace("2026-", "2062-"))
