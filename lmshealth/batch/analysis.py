@@ -5,11 +5,11 @@ from dataclasses import replace
 from datetime import datetime
 from pathlib import Path
 
+from lmshealth.batch.constants import NO_LOSS
 from lmshealth.errors import BadLog, NotEnoughData
 from lmshealth.io.column_map import ColumnsGiven, column_map
 from lmshealth.io.log import Log, Notice, Refusal
 from lmshealth.io.manifest import (
-    Manifest,
     copy_error,
     find_logs,
     read_manifest,
@@ -20,11 +20,11 @@ from lmshealth.machine.assessment import Assessment, assess
 from lmshealth.modal.identification import identify
 from lmshealth.modal.log_estimates import LogEstimates
 from lmshealth.signal.readings import loop_error
-from lmshealth.stage.description import Stage, expect_stage
+from lmshealth.stage.description import Stage, expect_stage, why_unmatched
 from lmshealth.tracking.maintenance import (
-    NO_MAINTENANCE,
     baseline_notices,
     read_maintenance,
+    read_maintenance_beside,
     without_logs,
 )
 
@@ -43,10 +43,10 @@ def analyse(
     Parameters
     ----------
     logs : path, or iterable of paths or logs
-        A folder with its ``manifest.csv`` and ``maintenance.csv``, or files, with the manifest
-        beside each, or results of `read_log`.
+        A folder with its ``manifest.csv`` and ``maintenance.csv``, or files, with those beside
+        each, or results of `read_log`.
     stage : Stage
-        Description of the machine.
+        Description of the machine; a log that it does not match is refused.
     columns, latest
         As of `read_log`.
     epochs, seed : int
@@ -73,9 +73,8 @@ def analyse(
     lmshealth.errors.NotEnoughData: no log can be used: none is given
     """
     expect_stage(stage)
-    work, refused, found = NO_MAINTENANCE, list[Refusal](), list[LogEstimates]()
+    refused, found = list[Refusal](), list[LogEstimates]()
     given: list[Path | Log]
-    manifests: dict[Path, Manifest] = {}
     used = column_map(columns)
     if isinstance(logs, str | Path):
         folder = Path(logs)
@@ -86,23 +85,33 @@ def analyse(
         manifests = dict.fromkeys(listed.logs, manifest)
     else:
         given = [one if isinstance(one, Log) else Path(one) for one in logs]
+        paths = [one for one in given if isinstance(one, Path)]
+        manifests = {path: read_manifest_beside(path) for path in paths}
+        work = read_maintenance_beside(paths, latest)
+
+    def is_unlisted(one: Path | Log) -> bool:
+        return isinstance(one, Path) and not manifests[one].names(one)
+
     seen: dict[str, tuple[str, dict[str, str]]] = {}
-    for one in given:
+    # Of several copies the one in a manifest is analysed: only that one has its metadata.
+    for one in sorted(given, key=is_unlisted):
         overrides: dict[str, str] = {}
         try:
             log = one
             if isinstance(log, Path):
-                manifest = manifests[log] if log in manifests else read_manifest_beside(log)
-                overrides = manifest.overrides(log)
+                overrides = manifests[log].overrides(log)
                 log = read_log(log, columns=used, overrides=overrides, latest=latest)
             if log.digest in seen:
                 raise copy_error(log.name, overrides, *seen[log.digest])
             seen[log.digest] = log.name, overrides
+            stated = log.metadata.stage or log.metadata.description
+            if stated is not None and not stage.matches(log.metadata):
+                raise BadLog(log.name, "no-stage", why_unmatched(log.metadata, [stage]))
             modes = identify(log, stage)
             own = log.name, log.digest, log.metadata, modes, loop_error(log)
             found.append(LogEstimates(*own, sample_rate=log.sample_rate))
         except BadLog as error:
-            is_declared = isinstance(one, Path) and manifest.is_baseline(one)
+            is_declared = isinstance(one, Path) and manifests[one].is_baseline(one)
             refusal = Refusal(error.log, error.reason, error.detail, baseline=is_declared)
             refused.append(refusal)
     if not found:
@@ -112,4 +121,6 @@ def analyse(
     instead = baseline_notices(refused, made.history.logs[made.history.baseline])
     for note in without_logs(work.actions, [made.history.stage]):
         instead.append(Notice("maintenance-unused", "caution", "maintenance.csv", note))
-    return replace(made, refused=(*refused, *made.refused), notices=(*made.notices, *instead))
+    lost = tuple(one for one in refused if one.reason not in NO_LOSS)
+    notices = (*made.notices, *instead)
+    return replace(made, lost=lost, refused=(*refused, *made.refused), notices=notices)

@@ -1,5 +1,8 @@
 """Limits, time-outs and retries of batch analysis."""
 
+NO_LOSS = "duplicate", "not-listed"
+"""Reasons of refusals by which no log is lost: copies, and logs that a manifest omits."""
+
 TASKS_AHEAD = 3
 """Tasks per worker that are submitted before their results are fetched. Two keep a worker busy
 while its result travels; the third covers tasks of unequal length. Each is held in memory."""

@@ -28,9 +28,8 @@ from lmshealth.io.reading import content_digest, read_log, require_identity
 from lmshealth.io.refusal import visible
 from lmshealth.modal.log_estimates import LogEstimates
 from lmshealth.report.language import LANGUAGES, Language
-from lmshealth.stage.description import Stage
+from lmshealth.stage.description import Stage, why_unmatched
 
-NOT_LISTED = "not-listed"
 """Reason in refused.csv of a log that is analysed, though the manifest of its folder omits it."""
 
 LogKey = tuple[str, str]
@@ -166,7 +165,7 @@ def ingest(
     copies = {one.log for one in refused if one.reason == "duplicate"}
     unlisted = (name_of(path, folder) for path in found if manifest.omits(path))
     refused += [
-        Refusal(name, NOT_LISTED, "it is read with its own metadata; add a row")
+        Refusal(name, "not-listed", "it is read with its own metadata; add a row")
         for name in unlisted
         if name not in copies
     ]
@@ -425,7 +424,7 @@ def identify_log(
         described = _matching(stages, log.metadata)
         if described is None:
             by = _none_of(stages)
-            raise BadLog(task.name, "no-stage", _unmatched(log.metadata, stages))
+            raise BadLog(task.name, "no-stage", why_unmatched(log.metadata, stages))
         by = described.digest
         require_identity(log, odometer=described.description.life.clock == "odometer")
         reading = read_modes(log, described, progress=_within(limit, task.name))
@@ -452,18 +451,3 @@ def identify_log(
 def unexpected(error: Exception, attachment: str) -> str:
     """Describe an exception that this program should not raise, and ask for a report."""
     return visible(f"{type(error).__name__}: {error}; please report this with {attachment}")
-
-
-def _unmatched(metadata: Metadata, stages: Sequence[Stage]) -> str:
-    """Explain why no description matches a log, and the two places to correct that."""
-    if metadata.description is not None:
-        return (
-            f"its description is to be {metadata.description!r}, and --stage gives "
-            f"{', '.join(stage.name for stage in stages)}; give that one, or correct column "
-            "description of manifest.csv"
-        )
-    asked = ", ".join(f"{stage.description.match.stage!r} in {stage.name}" for stage in stages)
-    return (
-        f"no description matches stage {metadata.stage!r}: [match] stage is {asked}; correct it "
-        "there, or give by --stage the description of this machine"
-    )

@@ -35,7 +35,7 @@ from lmshealth.batch.assess import (
     reason_if_failed,
     unpack_logs,
 )
-from lmshealth.batch.ingest import NOT_LISTED, Ingested, Settings, ingest
+from lmshealth.batch.ingest import Ingested, Settings, ingest
 from lmshealth.batch.store import Resources, Store, cached, default_url, unpack_or_none
 from lmshealth.batch.workers import Progress
 from lmshealth.errors import LmshealthError, NothingUsable
@@ -44,7 +44,7 @@ from lmshealth.io.manifest import MANIFEST, MISSPELT, NOT_LOGS
 from lmshealth.io.refusal import listed, visible
 from lmshealth.machine.assessment import Assessment
 from lmshealth.machine.status import Change, Status, judge_on, make_status, on_day
-from lmshealth.machine.summary import Summary, after_work, summarise
+from lmshealth.machine.summary import Summary, summarise
 from lmshealth.report.language import Language, in_language
 from lmshealth.report.pages import by_urgency, date_page, file_names, make_page, write_index
 from lmshealth.report.tables import csv_text, join_csv, log_tables, machine_tables, refused_rows
@@ -58,8 +58,6 @@ from lmshealth.tracking.maintenance import (
 
 # Output of one machine
 
-# Reasons of refusals by which no log is lost.
-_COPIES = "duplicate", NOT_LISTED
 # matplotlib's settings are shared by the threads of a Dask worker.
 _DRAWING = threading.Lock()
 
@@ -100,11 +98,10 @@ def machine_output(record: MachineRecord) -> MachineOutput | None:
         return None
     instead = baseline_notices(record.lost, found.history.logs[found.history.baseline])
     found = replace(found, lost=record.lost, notices=(*found.notices, *instead))
-    left = after_work(found)
-    summary = summarise(found, left.service(), record.file)
+    summary = summarise(found, found.service(), record.file)
     status = make_status(found, summary)
     with _DRAWING, in_language(record.language):
-        page = make_page(left, summary, before=record.before)
+        page = make_page(found, summary, before=record.before)
     rows = machine_tables(found, summary) if logs else {}
     tables = {name: csv_text(name, own) for name, own in rows.items()}
     of_logs = [log_tables(one) for one in sort_by_time(logs)]
@@ -298,8 +295,10 @@ def _count(
 ) -> tuple[dict[str, int], set[str]]:
     """Count the logs of a run, by field of `RunResult`; return also which were refused whole."""
     excluded = {log for output in made.values() for log in output.excluded}
-    copies, unlisted = ({one.log for one in refused if one.reason == reason} for reason in _COPIES)
-    others = {refusal.log for refusal in refused if refusal.reason not in _COPIES}
+    copies, unlisted = (
+        {one.log for one in refused if one.reason == reason} for reason in constants.NO_LOSS
+    )
+    others = {refusal.log for refusal in refused if refusal.reason not in constants.NO_LOSS}
     lost = (others - copies | excluded) & ingested.logs
     misspelt = sum(one.reason == MISSPELT for one in refused)
     counts = {
@@ -519,7 +518,7 @@ def _records(
     """Return what fetches the results of a machine, of which some logs were refused as a whole."""
     lost: dict[str, list[Refusal]] = {}
     for one in refused:
-        if one.reason not in _COPIES:
+        if one.reason not in constants.NO_LOSS:
             lost.setdefault(one.machine, []).append(one)
 
     def record(name: str, key: str, file: str, logs: PackedLogs | None = None) -> MachineRecord:

@@ -259,7 +259,8 @@ def prognose(ctx: click.Context, /, table: Path, **given: Any) -> None:
         done = work.of(prognosis.stage).since(prognosis.recorded_at)
         left = without_limits(prognosis, restored(words, done))
         shown, last = left or prognosis, prognosis.recorded_at.date()
-        life, service, before = summarise_life(shown, stage), decide(left, decision), None
+        life, service = summarise_life(shown, stage, whole=prognosis), decide(left, decision)
+        before = None
         if by is not None and by > last:
             before = by, probability_before(shown, by)
         elif by is not None:

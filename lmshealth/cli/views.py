@@ -384,7 +384,7 @@ def print_summaries(summaries: Sequence[Summary]) -> None:
             for parameter in one.health:
                 print_text(f"  {_parameter(parameter)}")
             if one.life is not None:
-                print_life(one.life, one.service)
+                print_life(one.life, one.service, when=text.service_on_day(one))
         return
     shown = [
         {
@@ -422,10 +422,17 @@ def _travel_left(life: Life | None) -> str:
     return middle if low == high else f"{middle} ({low} to {high})"
 
 
-def print_life(life: Life, service: Service, before: tuple[date, FloatArray] | None = None) -> None:
+def print_life(
+    life: Life,
+    service: Service,
+    before: tuple[date, FloatArray] | None = None,
+    *,
+    when: str = "",
+) -> None:
     """Print the quantiles of the remaining life for each limit and any, then the service.
 
-    ``before`` is a day with the probabilities that each limit is reached before it.
+    ``before`` is a day with the probabilities that each limit is reached before it; ``when`` is the
+    service as of a day, by default that at the last log.
     """
     blocks = [list(_limit_cells(life, k, before)) for k in range(len(life.limits))]
     # Rows of any limit that are those of one limit, but for its name, are not repeated.
@@ -448,7 +455,10 @@ def print_life(life: Life, service: Service, before: tuple[date, FloatArray] | N
     if life.undetermined:
         names = ", ".join(map(spell, life.undetermined))
         print_text(f"Not included: the limit of {names}, which the modes cannot determine.")
-    for sentence in _advice(life, service):
+    if life.restored:
+        names = ", ".join(map(spell, life.restored))
+        print_text(f"Not included: the limit of {names}, which later work has restored.")
+    for sentence in _advice(life, service, when):
         print_text(sentence)
     print_line("")
 
@@ -475,7 +485,7 @@ def _limit_cells(
         yield (f"  before {asked}: {text.probability_range(bounds[:, index].tolist())}",)
 
 
-def _advice(life: Life, service: Service) -> Iterator[str]:
+def _advice(life: Life, service: Service, when: str) -> Iterator[str]:
     """Yield when to service, by which rule, and the risk of a planned service."""
     if math.isnan(service.wait):
         yield "Service: not known before a log shows the effect of the work that was entered."
@@ -484,9 +494,12 @@ def _advice(life: Life, service: Service) -> Iterator[str]:
         rule = f"accepted risk {text.percent(service.max_risk)}"
     else:
         rule = f"least cost, where a failure costs {service.cost_ratio:.3g} times a service"
-    yield f"Service: {text.service_text(service)} ({rule})."
+    plain = text.service_text(service)
+    yield f"Service: {when or plain} ({rule})."
     risk = text.probability(service.risk) if service.risk >= 0 else ""
     if service.kind == "later":
+        if when not in ("", plain):  # something else is to be done first
+            return
         shown = " for what the modes show" if life.undetermined else ""
         yield f"No service is needed within {text.km(life.horizon)}{shown}."
     elif service.by is None:

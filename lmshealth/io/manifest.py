@@ -11,12 +11,14 @@ import os
 import re
 import stat
 import unicodedata
+import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import datetime
 from difflib import get_close_matches
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -88,6 +90,8 @@ def read_sheet(path: Path, needed: Sequence[str]) -> Iterator[Row]:
         raise Unusable("columns", f"columns are {listed(names)}; {detail}")
     for where, cells, trouble in records:
         stripped = [cell.strip() for cell in cells]
+        if not any(stripped):  # spreadsheets write the rows below a table
+            continue
         if not trouble and any(stripped[len(names) :]):
             trouble = f"{len(cells)} cells in {len(names)} columns"
         padded = dict.fromkeys(names, "") | dict(zip(names, stripped, strict=False))
@@ -113,13 +117,31 @@ def _records(lines: list[str], delimiter: str) -> Iterator[tuple[str, list[str],
 
 
 def read_rows(path: Path, needed: Sequence[str]) -> "pd.DataFrame":
-    """Read a table of estimates as text; `BadTable` if a column is missing or it cannot be read."""
+    """Read a table of estimates as text; `BadTable` if a column is missing or it cannot be read.
+
+    Empty cells beyond the columns, and empty rows, are left out.
+    """
     import pandas as pd  # late, as below: tables next to logs need none of it
 
+    read: Any = partial(pd.read_csv, path, dtype=str, keep_default_na=False)
+    table: pd.DataFrame
     try:
-        table = pd.read_csv(path, dtype=str, keep_default_na=False)
+        names = read(header=None, nrows=1).iloc[0].str.strip().tolist()
+        with warnings.catch_warnings():
+            warnings.simplefilter("error", pd.errors.ParserWarning)
+            try:
+                table = read(index_col=False)
+            except pd.errors.ParserWarning:  # all rows are longer, as by a delimiter at their ends
+                table = read(header=0, names=[*range(len(names) + 1)])
     except (OSError, ValueError) as error:
-        raise BadTable(f"{path}: cannot be read as a table: {error}") from error
+        raise BadTable(f"{path}: cannot be read as a table: {str(error).strip()}") from error
+    if twice := repeated(filter(None, names)):
+        raise BadTable(f"{path}: columns {twice} are there twice; needed is one of each")
+    if (beyond := (table.iloc[:, len(names) :] != "").any(axis=1)).any():
+        what = f"{len(names) + 1} cells in {len(names)} columns"
+        raise BadTable(f"{path}, {lines(table, beyond)}: {what}")
+    table = table.iloc[:, : len(names)].set_axis(names, axis=1)
+    table = table[(table != "").any(axis=1)]
     if missing := [name for name in needed if name not in table.columns]:
         hint = "; columns are separated by commas" if len(table.columns) == 1 else ""
         raise BadTable(f"{path}: no column {missing}; there are {list(table.columns)}{hint}")
@@ -129,6 +151,9 @@ def read_rows(path: Path, needed: Sequence[str]) -> "pd.DataFrame":
 def name_machine(path: Path, table: "pd.DataFrame") -> list[str]:
     """Fill in a missing column stage, in place, and return a note of it."""
     if "stage" in table.columns:
+        if (nameless := table["stage"].str.strip() == "").any():
+            what = "stage is empty; needed is a name"
+            raise BadTable(f"{path}, {lines(table, nameless)}: {what}")
         return []
     table["stage"] = path.stem
     return [f"no column stage: all rows are taken for one machine, {path.stem}"]

@@ -207,12 +207,15 @@ def infer(
     seed, chains : int or sequence of int, bool
         As in `fit_life`.
     epochs : int or sequence of int
-        Logs at which health is published, or at most how many.
+        Logs at which health is published, in order, with the last one at the end, or at most how
+        many.
 
     Raises
     ------
     BadStage, NotEnoughData, NotConverged
         As `fit_life`.
+    BadQuestion
+        If the epochs are other ones.
 
     Examples
     --------
@@ -231,7 +234,14 @@ def infer(
     True
     """
     life = fit_life(history, stage, seed, chains=chains)
-    chosen = epochs_to_publish(history, stage, epochs) if isinstance(epochs, int) else epochs
+    if isinstance(epochs, int | np.integer):
+        return health_of(life, history, stage, epochs_to_publish(history, stage, int(epochs)))
+    chosen, last = [*map(int, epochs)], len(history.logs) - 1
+    if chosen != sorted(set(chosen)) or chosen[-1:] != [last] or chosen[0] < history.baseline:
+        raise BadQuestion(
+            f"epochs = {chosen}: needed are numbers of logs from {history.baseline} to {last} in "
+            f"order, the last of which is {last}: health is published up to now"
+        )
     return health_of(life, history, stage, chosen)
 
 

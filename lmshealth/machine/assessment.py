@@ -5,6 +5,7 @@ Everything here is a function of its arguments: no store, no file, no process, n
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from datetime import date
@@ -15,7 +16,7 @@ from numpy.linalg import LinAlgError
 
 from lmshealth._private.serialize import fingerprint, seed_of
 from lmshealth._private.tables import fact
-from lmshealth.errors import LmshealthError, NotEnoughData
+from lmshealth.errors import BadQuestion, LmshealthError, NotEnoughData
 from lmshealth.io.log import Notice, Refusal
 from lmshealth.life import constants, fleet_prior
 from lmshealth.life.health import Health, epochs_to_publish, health_of
@@ -31,7 +32,7 @@ from lmshealth.life.verdict import (
     undeclared_events,
 )
 from lmshealth.machine.constants import DRIFT_SIGMA
-from lmshealth.machine.service import Service, decide
+from lmshealth.machine.service import Service, decide, without_limits
 from lmshealth.modal.log_estimates import LogEstimates
 from lmshealth.modal.spectra_summary import Waterfall
 from lmshealth.stage.description import Stage, expect_stage
@@ -48,6 +49,7 @@ from lmshealth.tracking.maintenance import (
     Maintenance,
     baseline_notices,
     maintenance_notices,
+    restored,
 )
 from lmshealth.tracking.track import Track, accepted_estimates, outlier_refusals, track
 
@@ -94,9 +96,20 @@ class Assessment:
         lines.append(f"{len(self.history.logs)} logs, {len(self.refused)} refusals; with {there}")
         return "\n".join(lines)
 
+    @property
+    def restored(self) -> set[str]:
+        """Parameters that work after the last log has restored."""
+        work = {notice.where for notice in self.notices if notice.code == "no-log-since"}
+        return restored({one.name: one.word for one in self.stage.parameters}, work)
+
+    @property
+    def limits_left(self) -> Prognosis | None:
+        """The remaining life without the limits that later work has restored; None without any."""
+        return without_limits(self.prognosis, self.restored)
+
     def service(self) -> Service:
-        """Choose the day of the service by the rule of the description."""
-        return decide(self.prognosis, self.stage.description.decision)
+        """Choose the day of the service by the rule of the description, for `limits_left`."""
+        return decide(self.limits_left, self.stage.description.decision)
 
     @property
     def alarmed(self) -> tuple[str, ...]:
@@ -233,6 +246,8 @@ def assess(
         If the stage is no result of `load_stage`.
     NotEnoughData
         If the logs are of several machines.
+    BadQuestion
+        If a log is there twice, or epochs or seed are out of range.
 
     Examples
     --------
@@ -248,6 +263,13 @@ def assess(
     'a life needs at least 3 logs and some travel'
     """
     expect_stage(stage)
+    logs = [*logs]
+    if epochs < 1 or seed < 0:
+        raise BadQuestion(f"epochs = {epochs}, seed = {seed}: needed at least 1, and at least 0")
+    contents = Counter(one.digest or (one.log, one.metadata.recorded_at) for one in logs)
+    if len(contents) < len(logs):
+        content, n = contents.most_common(1)[0]
+        raise BadQuestion(f"the log {content} is given {n} times; needed is each log once")
     machines = sorted({one.metadata.stage or "" for one in logs})
     if len(machines) > 1:
         named = ", ".join(machines)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
-from datetime import date, datetime, timedelta
+from datetime import UTC, date, datetime, timedelta
 from typing import Any, Literal
 
 import msgspec
@@ -251,8 +251,7 @@ def conditions(status: Status, today: date) -> dict[str, DeviceHealth]:
     unusable = verdict == "not-enough-data" and bool(serious - {"large-drift"})
     no_verdict = not judged and (status.infers_health or unusable)
     reached = (status.probability_limit_reached or 0.0) >= constants.FAILURE_PROBABILITY
-    soon = today + timedelta(days=constants.SERVICE_LEAD_DAYS)
-    is_due = judged and by is not None and by <= soon
+    is_due = judged and _is_near(by, today)
     found: list[tuple[DeviceHealth, str, object]] = [
         ("FAILURE", "limit-reached", reached and not status.worked),
         ("OFF_SPEC", "alarm", status.alarms and not judged),
@@ -271,15 +270,21 @@ def conditions(status: Status, today: date) -> dict[str, DeviceHealth]:
     return {code: state for state, code, applies in found if applies}
 
 
+def _is_near(by: date | None, today: date) -> bool:
+    """Return whether a service by a day is due: it takes time to order parts and a visit."""
+    return by is not None and by <= today + timedelta(days=constants.SERVICE_LEAD_DAYS)
+
+
 def _at_last_log(status: Status) -> str:
     """Return the verdict at the last log; statuses of earlier versions have no other."""
     return status.verdict_at_last_log or status.verdict
 
 
 def _last_day(status: Status) -> date:
-    """Return the last day on which a machine without a further log is not silent."""
+    """Return the last day (UTC) on which a machine without a further log is not silent."""
     try:
-        return (status.recorded_at + timedelta(days=status.silent_after_days or np.inf)).date()
+        end = status.recorded_at + timedelta(days=status.silent_after_days or np.inf)
+        return end.astimezone(UTC).date()
     except OverflowError:
         return date.max
 
@@ -365,7 +370,7 @@ def _judged(status: Status, today: date) -> Status:
         status,
         conditions=found,
         device_health=state,
-        days_without_log=max((today - status.recorded_at.date()).days, 0),
+        days_without_log=max((today - status.recorded_at.astimezone(UTC).date()).days, 0),
         silent="silent" in found,
         unknown_since=status.recorded_at.date() if unknown else None,
         verdict=UNKNOWN if unknown else verdict,
@@ -421,7 +426,7 @@ def compare(
     now = msgspec.structs.replace(now, announced=tuple(announced))
     changes = [("alarm", "", mode) for mode in now.alarms if mode not in known]
     changes += [(code, "", _detail(code, now)) for code in once if code not in known]
-    changes += _transitions(before, now)
+    changes += _transitions(before, now, today)
     severities = dict(CHANGES)
     if not _is_loss(_at_last_log(now)):
         severities["verdict"] = severities["verdict, no loss"]
@@ -437,28 +442,29 @@ def _detail(code: str, now: Status) -> str:
     return f"probability {reached:.2f}" if code == "limit-reached" and reached else ""
 
 
-def _transitions(before: Status | None, now: Status) -> Iterator[tuple[str, str, str]]:
+def _transitions(before: Status | None, now: Status, today: date) -> Iterator[tuple[str, str, str]]:
     """Yield changes of verdict, silence and late logs; of a new machine only what is bad."""
     was, verdict = _at_last_log(before) if before else "", _at_last_log(now)
-    last = (before or now).recorded_at.date().isoformat()
     if was != verdict and ((before and now.infers_health) or _is_loss(verdict)):
         recovered = _is_loss(was) and verdict == "healthy"
         yield "recovered" if recovered else "verdict", was, verdict
     elif before and before.alarms and not now.alarms:
         yield "recovered", f"alarm {' '.join(before.alarms)}", "no alarm"
     if now.silent and not _was_silent(before):
+        last = now.recorded_at.date().isoformat()
         yield "silent", f"last log of {last}", f"no log for {now.days_without_log} days"
-    elif _was_silent(before) and "silent" not in now.announced:
-        yield "recovered", f"no log since {last}", f"log of {now.recorded_at.date().isoformat()}"
+    elif before is not None and _was_silent(before) and "silent" not in now.announced:
+        last, latest = (one.recorded_at.date().isoformat() for one in (before, now))
+        yield "recovered", f"no log since {last}", f"log of {latest}"
     earlier = before.conditions if before else {}
     for code in _ENDING:
         if code in now.conditions and code not in earlier:
             yield code, "", _detail(code, now)
     if before:
-        yield from (("recovered", code, why) for code, why in _ended(before, now))
+        yield from (("recovered", code, why) for code, why in _ended(before, now, today))
 
 
-def _ended(before: Status, now: Status) -> Iterator[tuple[str, str]]:
+def _ended(before: Status, now: Status, today: date) -> Iterator[tuple[str, str]]:
     """Yield conditions that a later log has ended, or work that was entered, and which of both."""
     ended = before.conditions.keys() - now.conditions.keys()
     if now.alarms or _is_loss(_at_last_log(now)):  # they are the jump that was not confirmed
@@ -468,6 +474,8 @@ def _ended(before: Status, now: Status) -> Iterator[tuple[str, str]]:
         why = f"log of {now.recorded_at.date().isoformat()}"
         yield from ((code, why) for code in _ENDING if code in ended)
     elif _is_worked_on(before, now):
+        if _is_near(now.service_by, today):  # without a verdict it is no condition, and still due
+            ended -= {"service-due"}
         yield from ((code, "work was entered") for code in (*_ENDING, *_ONCE) if code in ended)
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from datetime import date, datetime
 from typing import Literal
 
@@ -24,10 +24,8 @@ from lmshealth.machine.service import (
     decide,
     remaining_days,
     risk_before,
-    without_limits,
 )
 from lmshealth.stage.description import ParameterSpec, Stage
-from lmshealth.tracking.maintenance import restored
 
 Step = Literal[
     "see-effect", "inspect", "find-cause", "check-drift", "check-loss", "log-now", "none", "record",
@@ -85,8 +83,7 @@ class NextStep:
 
 def next_step(assessment: Assessment, service: Service) -> NextStep:
     """Choose the next step at the last log by `CASES`."""
-    whole, mended = assessment.prognosis, restored_since(assessment)
-    prognosis = without_limits(whole, mended)
+    whole, prognosis, mended = assessment.prognosis, assessment.limits_left, assessment.restored
     kind = "unknown" if prognosis is None else service.kind
     n_logs = len(assessment.history.logs) - assessment.history.baseline
     age = "young" if n_logs <= constants.YOUNG_LOGS else "old"
@@ -112,18 +109,6 @@ def next_step(assessment: Assessment, service: Service) -> NextStep:
         partial=bool(prognosis.unidentifiable),
         case=case,
     )
-
-
-def restored_since(assessment: Assessment) -> set[str]:
-    """Return the parameters that work after the last log has restored."""
-    work = {notice.where for notice in assessment.notices if notice.code == "no-log-since"}
-    return restored({one.name: one.word for one in assessment.stage.parameters}, work)
-
-
-def after_work(assessment: Assessment) -> Assessment:
-    """Leave the limits out that work after the last log has restored, unless these are all."""
-    left = without_limits(assessment.prognosis, restored_since(assessment))
-    return replace(assessment, prognosis=left or assessment.prognosis)
 
 
 def _ending_first(prognosis: Prognosis | None) -> list[str]:
@@ -241,6 +226,7 @@ class Life:
     # Parameters with a limit that the modes do not determine: excluded.
     undetermined: tuple[str, ...]
     calibration: Calibration | None = None  # by the ended lives of the fleet
+    restored: tuple[str, ...] = ()  # parameters whose limits are left out: later work restored them
 
     @property
     def any(self) -> LimitLife:
@@ -280,8 +266,12 @@ class Summary:
 
 
 def summarise(assessment: Assessment, service: Service, file: str = "") -> Summary:
-    """Summarise an assessment, with its page and the service by `after_work`."""
-    judgement, prognosis = assessment.judgement, after_work(assessment).prognosis
+    """Summarise an assessment, with its page and its service.
+
+    Limits that later work has restored are left out, unless these are all.
+    """
+    judgement, left = assessment.judgement, assessment.limits_left
+    prognosis = left or assessment.prognosis
     history, of_fleet = assessment.history, assessment.calibration
     healthy: State = "open" if assessment.left_out else "good"  # until a jump is confirmed or not
     states: dict[str, State] = {"healthy": healthy, OUTSIDE_MAP: "open"}
@@ -292,13 +282,13 @@ def summarise(assessment: Assessment, service: Service, file: str = "") -> Summa
     modes, deviates = assessment.track.modes if assessment.track else (), (*assessment.left_out,)
     if set(modes) == {*deviates}:
         deviates = ("all",)
-    step, urgency = next_step(assessment, service), assessment.urgency(service)
+    step = next_step(assessment, service)
     if step.kind == "see-effect":  # the day was that of the state before the work
         service = decide(None, assessment.stage.description.decision)
     return Summary(
         file=file,
         identity=judgement.stage,
-        urgency=urgency,
+        urgency=assessment.urgency(service),
         recorded_at=judgement.recorded_at,
         baseline_at=[*history.recorded_at, judgement.recorded_at][history.baseline],
         description=assessment.stage.digest,
@@ -311,7 +301,9 @@ def summarise(assessment: Assessment, service: Service, file: str = "") -> Summa
         probability=judgement.probability,
         why=judgement.why,
         health=tuple(_parameters(assessment)),
-        life=summarise_life(prognosis, assessment.stage, of_fleet) if prognosis else None,
+        life=summarise_life(prognosis, assessment.stage, of_fleet, assessment.prognosis)
+        if prognosis
+        else None,
         service=service,
         step=step,
         deviates=deviates if judgement.probability >= 0 else (),
@@ -330,7 +322,10 @@ def _postponed(
 
 
 def summarise_life(
-    prognosis: Prognosis, stage: Stage, calibration: Calibration | None = None
+    prognosis: Prognosis,
+    stage: Stage,
+    calibration: Calibration | None = None,
+    whole: Prognosis | None = None,
 ) -> Life:
     """Summarise a prognosis: quantiles and probabilities of every limit, and of any."""
     baselines = {spec.name: spec.baseline for spec in stage.parameters}
@@ -361,6 +356,7 @@ def summarise_life(
         laws=prognosis.laws,
         undetermined=prognosis.unidentifiable,
         calibration=calibration,
+        restored=tuple(n for n in (whole or prognosis).parameters if n not in prognosis.parameters),
     )
 
 

@@ -66,6 +66,9 @@ _DASHED: Any = (0, (5, 3))  # of baselines
 _KM = 1000.0
 _DPI = 200  # of images in a figure: enough for zooming and printing
 _LEVELS = np.array(constants.BAND_LEVELS)
+_MEDIAN = _LEVELS.size // 2
+# Of a baseline: up to it health is drawn; a median beyond it is no share of a baseline.
+_MOST_SHARE = 2.5
 _GRID_POINTS = 72
 _SEGMENT = 8192  # samples in a segment of a quick spectrum
 SIZE = (4.5, 2.8)  # of a figure in inches: its text is readable on a phone
@@ -227,10 +230,10 @@ def plot_health(ax: Axes, health: Health, parameter: str, limit: float | None) -
             texts.append(f"{text.moment(when)}, {text.whole_km(travel)}\n{own}")
         hints(ax, health.travel / _KM, bands[2], texts)
     _levels(ax, limit)
-    # Show bands up to 250 %, baseline and limit.
+    # Show bands up to a share, baseline and limit.
     values = [100.0, float(np.nanmin(bands[0])), float(np.nanmax(bands[4]))]
     values += [] if limit is None else [100 * limit]
-    low, high = min(values), min(max(values), 250.0)
+    low, high = min(values), min(max(values), 100 * _MOST_SHARE)
     ax.set_ylim(max(low - 0.06 * (high - low), 0.0), high + 0.06 * (high - low))
     ax.set_ylabel(tr("% of baseline"))
     return odometer(ax)
@@ -424,7 +427,7 @@ def plot_modes(ax: Axes, modes: Modes) -> Axes:
 def draw(result: Result, what: str = "", ax: Axes | None = None) -> Axes:
     """Plot a result, or a channel, mode or parameter of it, in Axes or a new figure of pyplot.
 
-    Health is drawn in % of 1: that of parameters with units by `Health.relative_to`.
+    Health is drawn in % of 1: that of parameters with a unit by `Health.relative_to`.
     """
     import matplotlib
     from matplotlib import pyplot
@@ -441,15 +444,17 @@ def draw(result: Result, what: str = "", ax: Axes | None = None) -> Axes:
             case Log():
                 return plot_log(axes, result, what)
             case Modes():
-                return plot_modes(axes, result)
+                return plot_modes(axes, result.select([names.index(what)]) if what else result)
             case History():
                 return plot_frequencies(axes, result, None, what or names[0])
             case Track():
                 return plot_track(axes, result, what or names[0])
             case Health():
-                return plot_health(axes, result, what or names[0], None)
+                return plot_health(axes, _expect_fractions(result), what or names[0], None)
             case Prognosis() if what not in ("", "any"):
-                return plot_life(axes, result, what)
+                # Laws begin at the baseline of their parameter.
+                begin = result.curve_quantiles[_MEDIAN, 0, names.index(what)]
+                return plot_life(axes, result, what, baseline=float(begin))
             case Prognosis():
                 return plot_survival(axes, result)
     raise TypeError(f"a {type(result).__name__} has no plot")
@@ -459,8 +464,20 @@ def _parts(result: Any) -> list[str]:
     """Return the names of the parts of a result that can be plotted."""
     if isinstance(result, Log):
         return [one.name for one in result.channels]
-    found = next((getattr(result, n) for n in ("parameters", "modes") if hasattr(result, n)), ())
+    kinds = "parameters", "modes", "names"
+    found = next((getattr(result, n) for n in kinds if hasattr(result, n)), ())
     return list(found)
+
+
+def _expect_fractions(health: Health) -> Health:
+    """Refuse health in the units of a description, whose baselines it does not have."""
+    median = float(np.nanmax(health.latest(0.5), initial=0.0))
+    if median > _MOST_SHARE:
+        raise BadQuestion(
+            f"{health.title()}: a median of {median:.4g} is no fraction of a baseline; plot "
+            "health.relative_to(baselines), with the baseline of each parameter of the description"
+        )
+    return health
 
 
 def _density(ax: Axes, draws: FloatArray) -> None:

@@ -106,7 +106,7 @@ def label(text: str) -> str:
         return text if chosen == "en" else known
     for own, translation in _patterns(chosen, "", ""):
         if found := own.fullmatch(text):
-            values = {name: _value(chosen, one) for name, one in found.groupdict().items()}
+            values = _values(chosen, found)
             return translation.format(**values)
     return _value(chosen, text)
 
@@ -176,10 +176,16 @@ def _sentences(chosen: Language, text: str) -> tuple[int, str] | None:
     if not ways:
         return None
     n, found, translation, joint, joined, rest = max(ways, key=lambda way: way[0])
-    values = {name: _value(chosen, value) for name, value in found.groupdict().items()}
+    values = _values(chosen, found)
     words = re.sub(r":[^{}]*}", "}", translation).format(**values)
     joint += f"{tr('and')} " if joined else ""
     return n, f"{words}{joint}{rest}".rstrip()
+
+
+def _values(chosen: Language, found: re.Match[str]) -> dict[str, str]:
+    """Translate the values of a template; what is quoted of ``refused.csv`` stays as it is."""
+    own = found.groupdict()
+    return {name: one if name == "detail" else _value(chosen, one) for name, one in own.items()}
 
 
 def _value(

@@ -22,12 +22,13 @@ from lmshealth.life.constants import LONE_NAMED, MIN_FIT
 from lmshealth.life.fleet_prior import FleetPrior, LawPrior, Pace
 from lmshealth.life.health import Health
 from lmshealth.life.posterior.likelihood import expected_scatter, scatter_prior
+from lmshealth.life.prognosis import Prognosis
 from lmshealth.life.verdict import OUTSIDE_MAP
 from lmshealth.machine.assessment import Assessment
 from lmshealth.machine.constants import LEVELS, RUL_LEVELS
 from lmshealth.machine.service import Service
 from lmshealth.machine.status import Status, chi_square_band, coming_states, notices
-from lmshealth.machine.summary import Summary, first_limit, limit_of, restored_since
+from lmshealth.machine.summary import Summary, first_limit, limit_of
 from lmshealth.report import constants, figures, text
 from lmshealth.report.language import mark, tr, tr_month
 from lmshealth.report.log_figures import plot_shapes, plot_spectra, shapes_size, spectra_size
@@ -60,7 +61,8 @@ def make_page(assessment: Assessment, summary: Summary, *, before: Summary | Non
     before : Summary, optional
         Summary of the machine in its previous report.
     """
-    prognosis, health, fleet = assessment.prognosis, assessment.latest_health, assessment.fleet
+    prognosis = assessment.limits_left or assessment.prognosis
+    health, fleet = assessment.latest_health, assessment.fleet
     highest = max((one.high for one in summary.health), default=1.0)
     content = _track_content(assessment)
     content |= {
@@ -69,7 +71,8 @@ def make_page(assessment: Assessment, summary: Summary, *, before: Summary | Non
         "summary": summary,
         "bar": float(np.clip(np.ceil(10 * highest + 0.5) / 10, 1.2, 2.0)),
         "first_limit": first_limit(prognosis),
-        "restored": text.joined(map(spell, sorted(restored_since(assessment)))),
+        "restored": text.joined(map(spell, sorted(assessment.restored))),
+        "prognosis": prognosis,
         "before": before,
         "mark": _MARK,
         "outside": list(_outside_map(assessment, content["mac"])),
@@ -90,7 +93,7 @@ def make_page(assessment: Assessment, summary: Summary, *, before: Summary | Non
         pictures[key] = figures.svg(draw, salt=f"p{len(pictures)}", size=size)
 
     _draw_history(assessment, content, add)
-    _draw_life(assessment, content["pairs"], summary.service, add)
+    _draw_life(assessment, prognosis, content["pairs"], summary.service, add)
     for key, (whole, size) in _log_pictures(assessment).items():
         pictures[key, "all"] = figures.inline(whole, salt=key, size=size)
     # An HTML parser needs no namespaces; without them the page names no address at all.
@@ -325,12 +328,13 @@ def _log_pictures(assessment: Assessment) -> dict[str, tuple[Any, tuple[float, f
 
 def _draw_life(
     assessment: Assessment,
+    prognosis: Prognosis | None,
     pairs: Iterable[tuple[tuple[str, ...], str, float]],
     service: Service,
     add: Callable[..., None],
 ) -> None:
     """Draw health and remaining life, where there are any."""
-    prognosis, health = assessment.prognosis, assessment.latest_health
+    health = assessment.latest_health
     specs = {spec.name: spec for spec in assessment.stage.parameters}
     for names, title, _ in pairs:
         add(figures.plot_posterior, "posterior", title, health=health, parameters=names)
@@ -370,15 +374,18 @@ _WORDS = (
 
 
 def file_names(identities: Iterable[str]) -> dict[str, str]:
-    """Name the pages of machines: valid on every file system and unique regardless of case."""
+    """Name the pages of machines: valid on every file system and unique regardless of case.
+
+    A machine whose identity is such a name has that, whatever others are called.
+    """
     taken = {"index", "how-to-read"}
-    names = {}
-    for identity in sorted(set(identities)):
+    stems = {}
+    for identity in identities:
         stem = re.sub(r"[^\w.-]+", "-", identity).strip("-._")[:_NAME_LENGTH] or "stage"
-        if _DEVICES.fullmatch(stem.split(".")[0]):
-            stem = f"stage-{stem}"
-        names[identity] = f"{free_name(stem, taken)}.html"
-    return names
+        is_device = _DEVICES.fullmatch(stem.split(".")[0])
+        stems[identity] = f"stage-{stem}" if is_device else stem
+    in_order = sorted(stems, key=lambda identity: (stems[identity] != identity, identity))
+    return {identity: f"{free_name(stems[identity], taken)}.html" for identity in in_order}
 
 
 def by_urgency(summaries: Iterable[Summary]) -> list[Summary]:

@@ -427,7 +427,16 @@ def changes(before: Summary, now: Summary) -> Iterator[str]:
             for k in (0, 3, 6)  # quantiles of 5, 50 and 95 %
         )
         spread = f" (90{GAP}%: {ends(low[1], high[1])})" if now.life and low[1] != high[1] else ""
-        yield tr("Remaining life, median: {change}.", change=f"{_from_to(*middle)}{spread}")
+        of_limits = [
+            {one.parameter for one in x.life.limits} if x.life else None for x in (before, now)
+        ]
+        if None in of_limits or of_limits[0] == of_limits[1]:
+            yield tr("Remaining life, median: {change}.", change=f"{_from_to(*middle)}{spread}")
+        else:
+            yield tr(
+                "Remaining life, median: {life}; before, it was until other limits.",
+                life=f"{middle[1]}{spread}",
+            )
     if before.service.by is not None or now.service.by is not None:
         yield _service_change(before.service.by, now.service.by)
     more, travel = now.n_logs - before.n_logs, now.travel - before.travel

@@ -539,3 +539,18 @@ def _check_map(path: Path, description: Description, modal_map: ModalMap) -> Non
                     f"the map, whose {name!r} at {f:.4g} Hz no [[mode]] describes; write {name!r}, "
                     "or, if these are two modes, describe both"
                 )
+
+
+def why_unmatched(metadata: Metadata, stages: Sequence[Stage]) -> str:
+    """Explain why no description matches a log, and the two places to correct that."""
+    if metadata.description is not None:
+        return (
+            f"its description is to be {metadata.description!r}, and --stage gives "
+            f"{', '.join(stage.name for stage in stages)}; give that one, or correct column "
+            "description of manifest.csv"
+        )
+    asked = ", ".join(f"{stage.description.match.stage!r} in {stage.name}" for stage in stages)
+    return (
+        f"no description matches stage {metadata.stage!r}: [match] stage is {asked}; correct it "
+        "there, or give by --stage the description of this machine"
+    )

@@ -1,5 +1,6 @@
 """Maintenance: actions on a machine, and which of them open a new baseline."""
 
+import os
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import datetime
@@ -92,6 +93,14 @@ def read_maintenance(
     return replace(
         work, unread=(*(UnreadableRow(one, None) for one in found.refused), *work.unread)
     )
+
+
+def read_maintenance_beside(
+    logs: Iterable[str | Path], latest: datetime | None = None
+) -> Maintenance:
+    """Read the ``maintenance.csv`` in the folder of each log, as far as there is one."""
+    tables = [folder / _FILE for folder in sorted({Path(log).parent for log in logs})]
+    return _read([(path, shown(path)) for path in tables if os.path.lexists(path)], latest)
 
 
 def read_work(path: Path | None, latest: datetime | None = None) -> Maintenance:

@@ -19,6 +19,7 @@ from lmshealth.errors import BadTable
 from lmshealth.io.log import BOOLEANS, Metadata, Refusal
 from lmshealth.io.log import covariates as known_covariates
 from lmshealth.io.manifest import lines, name_machine, read_rows, to_moments, to_numbers
+from lmshealth.io.refusal import listed
 from lmshealth.modal.log_estimates import LogEstimates
 from lmshealth.modal.modes import Modes
 from lmshealth.stage.description import Stage
@@ -97,7 +98,7 @@ def read_estimates(
     for name, value in fallbacks.items():
         if name not in table.columns:
             table[name] = value
-    notes = name_machine(path, table)
+    has_stage, notes = "stage" in table.columns, name_machine(path, table)
     to_moments(path, table, latest)
     notes += _drop_bad_damping(table)
     _check(path, table, stage)
@@ -107,7 +108,7 @@ def read_estimates(
         to_numbers(cross_terms, terms, ("cov_ln_f",))
         if (empty := terms["cov_ln_f"].isna()).any():
             raise BadTable(f"{cross_terms}, {lines(terms, empty)}: cov_ln_f is empty")
-        if notes or "stage" not in terms.columns:  # of one machine, or of that which has the log
+        if not has_stage or "stage" not in terms.columns:  # of one machine, or of that of the log
             machines = table.groupby("log")["stage"].unique()
             if (several := machines.index[machines.str.len() > 1]).size:
                 raise BadTable(
@@ -169,20 +170,34 @@ def read_drifts(
     notes = name_machine(path, table)
     to_numbers(path, table, ("drift", "drift_std", "travel_km"))
     to_moments(path, table, latest)
+    # Without names of logs, those of one moment are told apart by what they state.
+    key = [*table.columns] if "log" not in table.columns else ["stage", "log", "mode"]
+    if (again := table.duplicated(key, keep=False)).any():
+        first = table[again].iloc[0]
+        when = first["recorded_at"].isoformat()
+        raise BadTable(
+            f"{path}, {lines(table, again)}: the drift of {first['mode']} at {when} exists twice; "
+            "leave one of these rows out"
+        )
     std, most = table["drift_std"], constants.MOST_DRIFT
     _refuse(path, table, "drift", table["drift"].abs() > most, "a change of ln frequency")
     wrong = (std < 0) | (std > most) | ((std > 0) & (std < constants.LEAST_DRIFT_STD))
     _refuse(path, table, "drift_std", wrong, "a standard deviation of ln frequency, 0 at baseline")
-    nameless = table["stage"].str.strip() == ""
-    if nameless.any():
-        raise BadTable(f"{path}, {lines(table, nameless)}: stage is empty; needed is a name")
     terms = None
     if cross_terms is not None:
         terms = read_rows(cross_terms, ("recorded_at", "mode_a", "mode_b", "cov_drift"))
+        machines = table["stage"].unique().tolist()
+        if "stage" not in terms.columns and len(machines) > 1:
+            raise BadTable(
+                f"{cross_terms}: needed is a column stage: {path} has {listed(machines)}"
+            )
         if "stage" not in terms.columns:
-            terms["stage"] = str(table["stage"].iloc[0])
+            terms["stage"] = machines[0]
         to_numbers(cross_terms, terms, ("cov_drift",))
         to_moments(cross_terms, terms, latest)
+        if (strange := ~terms["stage"].isin(machines)).any():
+            found = f"{int(strange.sum())} of {len(terms)} covariances in {cross_terms} are of"
+            notes.append(f"{found} machines that the table does not have; they are not used")
     elif table["mode"].nunique() > 1:
         notes.append(
             "no covariances between the drifts of modes: they are assumed independent, though "
@@ -230,6 +245,13 @@ def _check(path: Path, table: pd.DataFrame, stage: Stage | None) -> None:
         needed = f"{what}, a positive number; leave rows out that have none"
         _refuse(path, table, name, ~(table[name] > 0), needed)
     named = table[table["mode"] != ""]
+    alike = ["stage", "log", "source", "frequency_hz", "frequency_std_hz"]
+    if (again := (table["mode"] == "") & table.duplicated(alike, keep=False)).any():
+        first = table[again].iloc[0]
+        raise BadTable(
+            f"{path}, {lines(table, again)}: {first['frequency_hz']:g} Hz exists twice for log "
+            f"{first['log']}; leave one of these rows out"
+        )
     twice = named.duplicated(["stage", "log", "mode", "source"], keep=False)
     if twice.any():
         first = named[twice].iloc[0]

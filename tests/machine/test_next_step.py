@@ -19,7 +19,6 @@ from lmshealth.machine.summary import (
     CASES,
     NextStep,
     Step,
-    after_work,
     next_step,
     step_of,
     summarise,
@@ -168,7 +167,7 @@ def test_work_that_was_entered_is_not_ordered_again(
     notices = (*made.notices, *maintenance_notices(work, moments))
     prognosis = replace(made.prognosis, remaining=remaining)
     found = replace(made, prognosis=prognosis, notices=notices)
-    summary = summarise(found, after_work(found).service())
+    summary = summarise(found, found.service())
     status, later = make_status(found, summary), moments[-1].date() + timedelta(days=900)
     summary = on_day(summary, status, later)
     codes = judge_on(status, later, None).conditions
@@ -206,14 +205,14 @@ def test_a_day_is_of_the_limits_that_no_work_has_restored(make: Maker) -> None:
     both = replace(made, prognosis=replace(prognosis, remaining=remaining))
     found = replace(both, notices=(*made.notices, *notices))
     alone = replace(made, prognosis=replace(prognosis, remaining=mount))
-    left, whole = after_work(found), summarise(both, both.service())
-    assert left.service() == after_work(alone).service() == alone.service() != both.service()
-    summary = summarise(found, left.service())
+    whole = summarise(both, both.service())
+    assert found.service() == alone.service() != both.service()
+    summary = summarise(found, found.service())
     assert [name for name, _ in summary.step.parts] == ["mount_stiffness"]
     assert summary.life is not None and whole.life is not None
     assert summary.life.any.travel == whole.life.limits[1].travel > whole.life.any.travel
     assert summary.postponed[0][2][1] < 0.06
-    for one, shown in ((both, True), (left, False)):
+    for one, shown in ((both, True), (found, False)):
         page = make_page(one, summary)
         assert ("First limit reached, most" in page) == shown
         assert ("Without guide preload, which later work has restored." in page) != shown
