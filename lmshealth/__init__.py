@@ -52,6 +52,7 @@ if TYPE_CHECKING:
     from lmshealth.tracking.history import History as History
     from lmshealth.tracking.history import build_history as build_history
     from lmshealth.tracking.track import Track as Track
+    from lmshealth.tracking.track import accepted_estimates as accepted_estimates
     from lmshealth.tracking.track import track as track
 
 __version__ = version("lmshealth")
@@ -84,7 +85,7 @@ _NAMES = {
     "stage.description": "Stage load_stage",
     "stage.identifiability": "Plan plan",
     "tracking.history": "History build_history",
-    "tracking.track": "Track track",
+    "tracking.track": "Track accepted_estimates track",
 }
 _HOMES = {name: module for module, names in _NAMES.items() for name in names.split()}
 __all__ = [*_HOMES]

@@ -15,7 +15,7 @@ import lmshealth
 
 # `save` and `load` came with the types of results, which need no example of their own;
 # `check_calibration` is a question that each description raises.
-MOST_NAMES = 24
+MOST_NAMES = 25
 CLASSES = "LmshealthError", "LogEstimates", "Settings"
 FUNCTIONS = sorted(name for name in lmshealth.__all__ if name.islower() or name in CLASSES)
 # Of these nothing is needed to import the package or to show help, and all take their time.
@@ -57,6 +57,7 @@ def assessed(folder: Path) -> str:
     readings.append(lmshealth.merge_setups(readings[:2]))
     history, refused = lmshealth.build_history(readings, stage)
     track = lmshealth.track(history, stage)
+    history = lmshealth.accepted_estimates(history, track, doubtful=True)
     health = lmshealth.infer(history, stage, seed=0)
     shown = Drifts("AX", track.recorded_at, track.travel, track.modes, track.drift, track.drift_cov)
     alone = lmshealth.infer_drifts(shown, stage, seed=0)

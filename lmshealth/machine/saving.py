@@ -116,7 +116,7 @@ def load(path: str | Path, kind: type[Kind] | None = None) -> SavedResult:
     Returns
     -------
     SavedResult
-        Equal to the one that was saved, bit for bit.
+        With all values of the one that was saved, bit for bit.
 
     Raises
     ------

@@ -5,12 +5,14 @@
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from difflib import get_close_matches
 from itertools import combinations
 from typing import Literal
 
 import numpy as np
 
 from lmshealth._private.arrays import FloatArray, ReadOnly
+from lmshealth.io.log import covariates
 from lmshealth.stage import constants
 from lmshealth.stage.description import ModeSpec, ParameterSpec, Stage
 from lmshealth.stage.identifiability import Identifiability, identifiability_of
@@ -95,15 +97,16 @@ class StageCheck(ReadOnly):
     n_logs: int  # typical ones
     model_std: float  # relative, of the map's sensitivities; NaN without
     unused: tuple[str, ...]  # modes of the map that are not described
+    misspelt: tuple[tuple[str, str], ...]  # covariates that are no key of logs, and the nearest key
 
 
 def check_stage(stage: Stage) -> StageCheck:
     """Check a stage description, with or without health parameters."""
-    modal_map = stage.modal_map
+    modal_map, slips = stage.modal_map, tuple(_misspelt(stage))
     if modal_map is None:
         modes = tuple(ModeCheck(mode, informs=False) for mode in stage.modes)
         n_logs, none = stage.description.baseline.logs, np.empty((0, 0))
-        return StageCheck(stage.name, modes, (), (), none, none, none, n_logs, np.nan, ())
+        return StageCheck(stage.name, modes, (), (), none, none, none, n_logs, np.nan, (), slips)
     information = identifiability_of(stage)
     # The ln parameters at their limits, or baselines; None off the map or without any limit.
     point = np.log([p.limit.below if p.limit else p.baseline for p in stage.parameters])
@@ -128,6 +131,7 @@ def check_stage(stage: Stage) -> StageCheck:
         n_logs=information.n_baseline,
         model_std=information.model_std,
         unused=tuple(name for name in modal_map.modes if name not in described),
+        misspelt=slips,
     )
 
 
@@ -202,10 +206,14 @@ class Diagnostic:
 
 def diagnose(checked: StageCheck) -> tuple[Diagnostic, ...]:
     """State the results of a check in sentences: of parameters, of the map, then of modes."""
+    slips = [
+        Diagnostic("modes", False, f"No key of logs is {name}, a covariate. Is {key} meant?")
+        for name, key in checked.misspelt
+    ]
     if not checked.parameters:
         text = "No [[parameter]]: modes are tracked and no health is inferred. For health, describe"
         text += " [[parameter]] and a [map] of its effect on the modes."
-        return (Diagnostic("parameters", True, text),)
+        return Diagnostic("parameters", True, text), *slips
     found = [_identified(checked, parameter) for parameter in checked.parameters]
     found += [*_correlated(checked), _surrogate(checked)]
     found += [one for parameter in checked.parameters for one in _map_range(parameter)]
@@ -213,7 +221,7 @@ def diagnose(checked: StageCheck) -> tuple[Diagnostic, ...]:
     if checked.unused:
         text = f"The map also has {', '.join(checked.unused)}, which no [[mode]] describes."
         found.append(Diagnostic("modes", True, text))
-    return tuple(found)
+    return *found, *slips
 
 
 def _identified(checked: StageCheck, parameter: ParameterCheck) -> Diagnostic:
@@ -314,6 +322,12 @@ def _searched(check: ModeCheck) -> Iterator[Diagnostic]:
             text = f"{mode.name} is searched from {low:.4g} to {high:.4g} Hz, but the map has it at"
             text += f" {frequency:.4g} Hz {when}. Widen its search, or correct map or frequency."
             yield Diagnostic("modes", False, text)
+
+
+def _misspelt(stage: Stage) -> Iterator[tuple[str, str]]:
+    """Yield covariates that are no key of logs, with the key that they nearly are."""
+    for name in (one.name for one in stage.description.covariate if one.name not in covariates()):
+        yield from ((name, near) for near in get_close_matches(name, covariates(), 1))
 
 
 def _share(value: float) -> str:

@@ -416,11 +416,24 @@ def _effects(state: TrackState) -> tuple[Effect, ...]:
 
 
 def accepted_estimates(history: History, track: Track, *, doubtful: bool = False) -> History:
-    """Return a history with the steps of its track and without its outliers.
+    """Return a history with the steps of its track and without its outliers, for lives.
 
     A suspected step is among them: a life without it competes with those that have it. One log does
-    not show whether it is in error or the machine has changed since: if ``doubtful``, ln f of the
-    first log of the present baseline stay, and are `History.in_doubt`.
+    not show whether it is in error or the machine has changed since: if ``doubtful``, as lives have
+    it, ln f of the first log of the present baseline stay, and are `History.in_doubt`.
+
+    Examples
+    --------
+    A life that is tracked step by step:
+
+    >>> import lmshealth
+    >>> from lmshealth import examples
+    >>> stage, history = lmshealth.load_stage("lms-y"), examples.history()
+    >>> track = lmshealth.track(history, stage)
+    >>> accepted = lmshealth.accepted_estimates(history, track, doubtful=True)
+    >>> health = lmshealth.infer(accepted, stage, seed=1, chains=False)
+    >>> round(health.latest(0.5)[0], 2)
+    0.71
     """
     ln_f, ln_zeta, cov = map(np.array, (history.ln_frequency, history.ln_damping, history.cov))
     steps = track.steps if track.suspected is None else (*track.steps, track.suspected)

@@ -56,6 +56,38 @@ def test_a_copy_of_a_log_is_refused(logs: Path, tmp_path: Path) -> None:
     assert "travel_km 7 (there 5)" in row.detail
 
 
+def test_of_two_copies_the_one_in_the_manifest_is_analysed(logs: Path, tmp_path: Path) -> None:
+    """Only that one has its metadata; also where another name comes first."""
+    folder = tmp_path / "logs"
+    shutil.copytree(logs, folder)
+    shutil.copy(folder / "1.csv", folder / "0-copy.csv")
+    (folder / "manifest.csv").write_text("file,travel_km\n0.csv,0\n1.csv,7\n")
+    for given in (folder, sorted(folder.glob("[01]*.csv"))):
+        found = lmshealth.analyse(given, lmshealth.load_stage("lms-y"), columns=EXPORT)
+        assert [Path(log).name for log in found.history.logs] == ["0.csv", "1.csv"]
+        assert found.history.travel.tolist() == [0.0, 7000.0]
+
+
+def test_a_log_of_another_machine_is_refused(logs: Path) -> None:
+    """As in a run: its modes are not those of the description."""
+    with pytest.raises(NotEnoughData, match=r"no description matches stage 'AX-3-Y'"):
+        lmshealth.analyse(logs, lmshealth.load_stage("lms-x"), columns=EXPORT)
+
+
+def test_files_are_analysed_with_the_maintenance_beside_them(logs: Path, tmp_path: Path) -> None:
+    """It opens the same baseline as that of the folder."""
+    folder = tmp_path / "logs"
+    shutil.copytree(logs, folder)
+    (folder / "maintenance.csv").write_text(
+        "stage,recorded_at,action\nAX-3-Y,2026-07-10T12:00:00Z,preload-adjust\n,,\n"
+    )
+    stage = lmshealth.load_stage("lms-y")
+    for given in (folder, sorted(folder.glob("[01].csv"))):
+        found = lmshealth.analyse(given, stage, columns=EXPORT)
+        assert found.history.baseline == 1
+        assert [one.code for one in found.notices].count("new-baseline") == 1
+
+
 def test_a_refused_log_that_was_declared_as_baseline_is_named(logs: Path, tmp_path: Path) -> None:
     """A log that cannot be read, and one that is not there: what is used instead is stated."""
     folder = tmp_path / "logs"

@@ -12,6 +12,8 @@ import xarray
 from arviz_stats.base.array import array_stats
 from scipy import stats
 
+import lmshealth
+from lmshealth import examples
 from lmshealth._private.arrays import FloatArray
 from lmshealth.errors import BadQuestion, BadStage, NotEnoughData
 from lmshealth.life import constants
@@ -131,6 +133,17 @@ def test_the_last_epoch_is_the_posterior_of_the_life(
     assert (health.r_hat == life.worst_r_hat).all()
     assert health.modes == life.modes == ("roll", "pitch", "yaw")
     assert health.sampler == ("importance",) * 11
+
+
+def test_epochs_end_with_the_last_log() -> None:
+    """Health of an earlier log would else be that of now, with another date."""
+    stage, history = lmshealth.load_stage("lms-y"), examples.history()
+    last = len(history.logs) - 1
+    two = lmshealth.infer(history, stage, 1, chains=False, epochs=[8, last])
+    assert two.recorded_at == (history.recorded_at[8], history.recorded_at[last])
+    for epochs in ([], [8], [last, 8], [8, 8, last], [-1], [last + 1]):
+        with pytest.raises(BadQuestion, match="numbers of logs from 0 to 23"):
+            lmshealth.infer(history, stage, 1, chains=False, epochs=epochs)
 
 
 def test_past_epochs_are_of_the_same_draws(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
-from datetime import UTC, date, datetime, timedelta
+from datetime import UTC, date, datetime, timedelta, timezone
 from pathlib import Path
 from typing import Any
 
@@ -255,6 +255,28 @@ def test_what_work_ends_without_a_new_log_is_announced(code: str) -> None:
     assert compare(served, status(works=2), TODAY, None)[1] == []
     again = msgspec.structs.replace(bad, works=2)
     assert [one.what for one in compare(served, again, TODAY, None)[1]] == [code]
+
+
+def test_a_service_that_is_near_is_not_ended_by_work_that_leaves_no_verdict() -> None:
+    """It is no condition without a verdict, and due as before. Control: a service far ahead."""
+    due = status(works=1, service_by=TODAY + timedelta(days=9))
+    found, _ = compare(status(works=1), due, TODAY, None)
+    for days, ended in ((10, []), (100, ["M7-Y: recovered service-due → work was entered"])):
+        worked = status(works=2, **OPEN | {"service_by": TODAY + timedelta(days=days)})
+        changes = compare(found, worked, TODAY, None)[1]
+        assert [str(one) for one in changes if one.what == "recovered"] == ended
+
+
+@pytest.mark.parametrize("hours", [-9, 0, 9])
+def test_a_silence_is_by_the_day_in_utc(hours: int) -> None:
+    """The same moment in any zone gives the same days; its first log since names the last one."""
+    moment = datetime(2026, 11, 20, 20, tzinfo=UTC).astimezone(timezone(timedelta(hours=hours)))
+    one = status(recorded_at=moment, silent_after_days=5.0)
+    found = [judge_on(one, date(2026, 11, day), None) for day in (25, 26)]
+    assert [(day.silent, day.days_without_log) for day in found] == [(False, 5), (True, 6)]
+    earlier = msgspec.structs.replace(found[0], recorded_at=moment - timedelta(days=40))
+    (change,) = compare(earlier, one, date(2026, 11, 26), None)[1]
+    assert change.before == f"last log of {moment.date().isoformat()}"
 
 
 def test_the_table_of_changes_is_that_of_the_readme(root: Path) -> None:

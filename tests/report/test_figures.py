@@ -179,6 +179,18 @@ def test_undetermined_health_is_drawn_as_prior(ax: Axes, history: History) -> No
     assert any(collection.get_hatch() for collection in ax.collections)
 
 
+def test_parameters_with_a_unit_are_drawn_by_their_baseline(prognosis: Prognosis) -> None:
+    """A life begins at its baseline; health does not have it, and must be given relative to it."""
+    name = prognosis.parameters[0]
+    scaled = replace(
+        prognosis,
+        limits=5000 * prognosis.limits,
+        curve_quantiles=5000 * prognosis.curve_quantiles,
+    )
+    tops = [one.plot(name).get_ylim()[1] for one in (prognosis, scaled)]
+    assert tops[1] == pytest.approx(tops[0])
+
+
 def test_life_shows_now_limit_and_horizon(ax: Axes, prognosis: Prognosis) -> None:
     """A horizon far behind the limit is named instead of squeezing the picture."""
     plots.plot_life(ax, prognosis, "guide_preload")

@@ -54,7 +54,9 @@ def percent_of(text: str) -> int:
     ("identities", "files"),
     [
         (["M7-Y"], ["M7-Y.html"]),
-        (["A 1", "A/1", "a-1"], ["A-1.html", "A-1-2.html", "a-1-3.html"]),
+        (["A 1", "A/1", "a-1"], ["a-1.html", "A-1-2.html", "A-1-3.html"]),
+        # Whose identity is a file name has that, also beside one that sorts before it.
+        (["LMS 3", "LMS-3"], ["LMS-3.html", "LMS-3-2.html"]),
         (["index", "..", "", "Führung"], ["index-2.html", "stage-2.html", "stage.html"]),
         (["x" * 70, "x" * 80], ["x" * 60 + ".html", "x" * 60 + "-2.html"]),
     ],
@@ -63,6 +65,7 @@ def test_files_are_safe_and_never_twice_the_same(identities: list[str], files: l
     """Signs that no file system takes are gone, and the order of the stages plays no part."""
     names = file_names(identities)
     assert set(files) <= set(names.values())
+    assert all(names[one] == f"{one}.html" for one in ("M7-Y", "LMS-3", "a-1") if one in names)
     assert len({name.casefold() for name in names.values()}) == len(identities)
     assert file_names(reversed(identities)) == names
     assert all(len(name) <= 70 and not set('/\\:*?"<>|') & set(name) for name in names.values())

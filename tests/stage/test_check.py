@@ -305,6 +305,19 @@ def test_modes_that_only_one_side_knows(tmp_path: Path) -> None:
     assert "The map also has pitch" in text
 
 
+def test_a_covariate_that_is_nearly_a_key_of_logs_is_named() -> None:
+    """Logs could not state it. A key, and a name of the user's own, are none."""
+    stage = load_stage("lms-y")
+    given = stage.description.covariate
+    assert given
+    for name, n in (("temprature_c", 1), ("temperature_c", 0), ("oil_level", 0)):
+        own = structs.replace(given[0], name=name)
+        described = structs.replace(stage.description, covariate=(own,))
+        checked = check_stage(replace(stage, description=described))
+        found = [one for one in diagnose(checked) if "Is temperature_c meant?" in one.text]
+        assert [one.good for one in found] == [False] * n
+
+
 def test_a_description_without_health_is_no_fault(tmp_path: Path) -> None:
     """One sentence, and no fault."""
     (finding,) = diagnose(check_stage(make_stage(tmp_path, ())))

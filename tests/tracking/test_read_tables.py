@@ -135,6 +135,33 @@ def test_logs_of_the_future_are_refused_unless_allowed(tmp_path: Path) -> None:
     assert read_drifts(drifts, latest=LAST_MOMENT)[0][0].recorded_at[0].year == 2062
 
 
+@pytest.mark.parametrize("end", [",\n", ",\n,,,,,,,,,,,\n", "\n,,,,,,,,,,,\n,,,,,,,,,,,\n"])
+def test_empty_cells_at_the_ends_of_lines_and_empty_rows_are_left_out(
+    tmp_path: Path, end: str
+) -> None:
+    """Programs end lines with a delimiter, spreadsheets a table with empty rows."""
+    (plain,) = read(tmp_path, HEAD + row())
+    (found,) = read(tmp_path, HEAD + row().replace("\n", end))
+    assert fingerprint(found) == fingerprint(plain)
+
+
+def test_a_damping_that_is_not_used_leaves_machines_apart(tmp_path: Path) -> None:
+    """Two machines have a log of one name; cross terms name their machine."""
+    text = "".join(
+        own.replace("AX-1", machine)
+        for machine in ("AX-1", "AX-2")
+        for own in (row(), row(source="delta_e"))
+    )
+    path, cross = tmp_path / "modes.csv", tmp_path / "modes_cov.csv"
+    cross.write_text(
+        "stage,log,source_a,mode_a,source_b,mode_b,cov_ln_f\nAX-1,a,acc,roll,delta_e,roll,1e-8\n"
+    )
+    for changed in (text, text.replace("0.02,0.001", "-0.02,0.001", 1)):
+        path.write_text(HEAD + changed)
+        one, two = (log.modes.cov[0, 1] for log in read_estimates(path, cross_terms=cross)[0])
+        assert (one, two) == (1e-8, 0.0)
+
+
 def test_cross_terms_enter_the_covariance_of_their_log(tmp_path: Path) -> None:
     """Cross terms of other logs, and of estimates that do not exist, are ignored."""
     text = HEAD + row() + row(mode="pitch") + row(log="b", day=2)
@@ -212,6 +239,11 @@ def test_assumptions_are_noted(tmp_path: Path) -> None:
         (HEAD + row().replace("2026", "9999"), "line 2: recorded_at is '9999-"),
         (HEAD + row().replace("2026", "2099"), "in the future; correct it, or set --allow-future"),
         (HEAD + row() + row(), "line 2, 3: roll by acc exists twice"),
+        (HEAD + row(mode="") + row(mode="", f=80) + row(mode=""), "line 2, 4: 126.4 Hz exists twi"),
+        (HEAD + row().replace("AX-1", " "), "line 2: stage is empty; needed is a name"),
+        (HEAD.replace("source", "mode") + row(), "columns ['mode'] are there twice"),
+        (HEAD + row().replace("\n", ",9\n"), "line 2: 13 cells in 12 columns"),
+        (HEAD + row() + row(log="b", day=2).replace("\n", ",\n"), "Expected 12 fields in line 3"),
         (HEAD + row() + row(mode="pitch", km=11), "log a has travel_km 10 and 11"),
         (HEAD + row(rho=1.0), "correlation_f_zeta reaches 1"),
         (HEAD + row().replace("+00:00", ""), "ISO 8601 with a time zone"),
@@ -360,6 +392,7 @@ def test_several_machines_stay_apart(tmp_path: Path) -> None:
         ),
         (DRIFT_HEAD + drift_row().replace("AX-1", ""), "", "line 2: stage is empty"),
         (DRIFT_HEAD + drift_row().replace("+00:00", ""), "", "ISO 8601 with a time zone"),
+        (DRIFT_HEAD + 2 * drift_row(), "", "line 2, 3: the drift of roll at .* exists twice"),
         (
             DRIFT_HEAD + drift_row() + drift_row(mode="pitch"),
             DRIFT_TERM.format(day=1, cov=1),
