@@ -183,9 +183,11 @@ def _sentences(chosen: Language, text: str) -> tuple[int, str] | None:
 
 
 def _values(chosen: Language, found: re.Match[str]) -> dict[str, str]:
-    """Translate the values of a template; what is quoted of ``refused.csv`` stays as it is."""
-    own = found.groupdict()
-    return {name: one if name == "detail" else _value(chosen, one) for name, one in own.items()}
+    """Translate the values of a template; unknown details, which quote a file, stay as they are."""
+    return {
+        name: one if name == "detail" and not _sentences(chosen, one) else _value(chosen, one)
+        for name, one in found.groupdict().items()
+    }
 
 
 def _value(

@@ -404,4 +404,7 @@ def test_details_of_a_damaged_log_are_translated(language: Any, tmp_path: Path) 
     with in_language(language):
         assert [one.detail for one in refused if not is_known(one.detail)] == []
         (flat,) = {one.detail for one in refused if one.reason == "flat"}
+        quoted = "line 2: recorded_at is '2026-07-25', needed ISO 8601"
+        unread = f"a.csv cannot be read completely ({quoted}): work on this machine that it lists "
+        assert quoted in sentence(f"{unread}there is not used.")
         assert sentence(flat) == "alle 10000 Abtastwerte sind 0 (SI); prüfen Sie den Sensor"
