@@ -38,7 +38,8 @@ def outcomes(rows):
     return len(rows)
 '''
 TASKS = [("a", k) for k in range(5)] + [("b", 0)]
-CACHES = provenance._digest, provenance._tree, provenance._statements, provenance._meaning
+CACHES = [getattr(provenance, f"_{name}") for name in ("digest", "tree", "statements", "meaning")]
+CACHES.append(provenance._definition)
 
 
 @pytest.fixture
@@ -195,34 +196,93 @@ def test_code_that_is_reached_counts(
     assert changed
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("first", "second", "same"),
     [("lives", "check", True), ("constants", "check", True), ("check", "lives", False)],
 )
+@pytest.mark.parametrize(
+    "uses",
+    [
+        "names",
+        "modules",
+        "inner",
+    ],
+)
+@pytest.mark.parametrize("name", ["sign", "constant", "through"])
 def test_a_definition_counts_wherever_it_is(
-    written: Any, monkeypatch: pytest.MonkeyPatch, first: str, second: str, same: bool
+    written: Any,
+    monkeypatch: pytest.MonkeyPatch,
+    first: str,
+    second: str,
+    same: bool,
+    uses: str,
+    name: str,
 ) -> None:
-    """Trials stay valid where a definition moves; not where two of one name change places."""
-    signs = {"lives": "", "constants": "", "check": "-"}
-    read, uses = Path.read_text, "place.__name__, first(1), second(1)"
+    """Trials stay valid where a definition moves; not where two of one name change places.
+
+    It is a function, a constant, or a function of the same text that names such a constant;
+    imported by its name, by its module, or inside of a function.
+    """
+    values = {"lives": "1", "constants": "1", "check": "2"}
+    read = Path.read_text
 
     def other(path: Path, *words: Any, **named: Any) -> str:
-        sign = signs.get(path.stem) if path.parent.name == "calibration" else None
-        more = "" if sign is None else f"def sign(x):\n    return {sign}x\n"
-        return f"{read(path, *words, **named)}\n{more}"
+        content, value = read(path, *words, **named), values.get(path.stem)
+        if value is None or path.parent.name != "calibration":
+            return content
+        return (
+            f"{content}\nconstant = {value}\ndef sign(x):\n    return {value} * x\n"
+            "def through(x):\n    return constant * x\n"
+        )
 
-    def code(first: str, second: str) -> str:
-        script = written(SCRIPT)
-        imports = [
-            f"from lmshealth.calibration.{home} import sign as {name}\n"
-            for name, home in (("first", first), ("second", second))
-        ]
-        text = "".join(imports) + SCRIPT.replace("SCALE *", f"({uses}) and SCALE *")
+    def code(*homes: str) -> str:
+        script, lines, body = written(SCRIPT), [], "first, second"
+        for alias, home in zip(("first", "second"), homes, strict=True):
+            if uses == "modules":
+                lines.append(f"from lmshealth.calibration import {home} as {alias}")
+                body = f"first.{name}, second.{name}"
+            else:
+                lines.append(f"from lmshealth.calibration.{home} import {name} as {alias}")
+        imports = "\n".join(lines)
+        text = SCRIPT.replace("SCALE *", f"place.__name__ and ({body}) and SCALE *")
+        if uses == "inner":
+            inner = imports.replace("\n", "\n    ")
+            text = text.replace("def scaled(number):", f"def scaled(number):\n    {inner}")
+        else:
+            text = f"{imports}\n{text}"
         Path(script.__file__).write_text(text)
         return provenance.code_of(script.draw)
 
     monkeypatch.setattr(Path, "read_text", other)
     assert (code(first, second) == code("lives", "check")) == same
+
+
+def test_reasons_and_places_of_modules(written: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Reasons why a figure is not met compute nothing; what a module makes of its place counts."""
+    text = SCRIPT.replace("SCALE *", "(NOT_MET or 1) and SCALE *")
+    codes = [
+        provenance.code_of(written(f"NOT_MET = {{'a': {reason!r}}}\n{text}").draw)
+        for reason in ("one", "other")
+    ]
+    assert codes[0] == codes[1]
+    read = Path.read_text
+
+    def other(path: Path, *words: Any, **named: Any) -> str:
+        more = "\nHERE = __file__\n" if path.stem in ("lives", "constants") else ""
+        return read(path, *words, **named) + more
+
+    monkeypatch.setattr(Path, "read_text", other)
+    found = set()
+    for home in ("lives", "constants"):
+        script = written(SCRIPT)
+        text = SCRIPT.replace("SCALE *", "place.__name__ and HERE and SCALE *")
+        Path(script.__file__).write_text(
+            f"from lmshealth.calibration.{home} import HERE\n"
+            f"from lmshealth.calibration import constants, lives\n{text}"
+        )
+        found.add(provenance.code_of(script.draw))
+    assert len(found) == 2
 
 
 def test_tables_that_are_read_count(written: Any, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -10,13 +10,14 @@ from lmshealth.errors import BadLog, NotEnoughData
 from lmshealth.io.column_map import ColumnsGiven, column_map
 from lmshealth.io.log import Log, Notice, Refusal
 from lmshealth.io.manifest import (
+    NOT_LOGS,
     copy_error,
     find_logs,
     read_manifest,
     read_manifest_beside,
 )
 from lmshealth.io.reading import read_log
-from lmshealth.machine.assessment import Assessment, assess
+from lmshealth.machine.assessment import Assessment, assess, expect_settings
 from lmshealth.modal.identification import identify
 from lmshealth.modal.log_estimates import LogEstimates
 from lmshealth.signal.readings import loop_error
@@ -73,6 +74,7 @@ def analyse(
     lmshealth.errors.NotEnoughData: no log can be used: none is given
     """
     expect_stage(stage)
+    expect_settings(epochs, seed)
     refused, found = list[Refusal](), list[LogEstimates]()
     given: list[Path | Log]
     used = column_map(columns)
@@ -86,7 +88,9 @@ def analyse(
     else:
         given = [one if isinstance(one, Log) else Path(one) for one in logs]
         paths = [one for one in given if isinstance(one, Path)]
-        manifests = {path: read_manifest_beside(path) for path in paths}
+        beside = {path.parent: path for path in paths}
+        of_folder = {folder: read_manifest_beside(path) for folder, path in beside.items()}
+        manifests = {path: of_folder[path.parent] for path in paths}
         work = read_maintenance_beside(paths, latest)
 
     def is_unlisted(one: Path | Log) -> bool:
@@ -112,15 +116,19 @@ def analyse(
             found.append(LogEstimates(*own, sample_rate=log.sample_rate))
         except BadLog as error:
             is_declared = isinstance(one, Path) and manifests[one].is_baseline(one)
+            machine = log.metadata.stage if isinstance(log, Log) else overrides.get("stage")
             refusal = Refusal(error.log, error.reason, error.detail, baseline=is_declared)
-            refused.append(refusal)
+            refused.append(replace(refusal, machine=machine or ""))
     if not found:
         why = "; ".join(f"{one.log}: {one.detail}" for one in refused[:3]) or "none is given"
         raise NotEnoughData(f"no log can be used: {why}")
     made = assess(found, stage, work=work, epochs=epochs, seed=seed)
-    instead = baseline_notices(refused, made.history.logs[made.history.baseline])
-    for note in without_logs(work.actions, [made.history.stage]):
+    machine = made.history.stage
+    mine = [one for one in refused if one.machine in ("", machine)]
+    instead = baseline_notices(mine, made.history.logs[made.history.baseline])
+    for note in without_logs(work.actions, [machine]):
         instead.append(Notice("maintenance-unused", "caution", "maintenance.csv", note))
-    lost = tuple(one for one in refused if one.reason not in NO_LOSS)
+    logs_lost = (one for one in mine if Path(one.log).name not in NOT_LOGS)
+    lost = tuple(one for one in logs_lost if one.reason not in NO_LOSS)
     notices = (*made.notices, *instead)
     return replace(made, lost=lost, refused=(*refused, *made.refused), notices=notices)

@@ -30,8 +30,6 @@ from lmshealth.modal.log_estimates import LogEstimates
 from lmshealth.report.language import LANGUAGES, Language
 from lmshealth.stage.description import Stage, why_unmatched
 
-"""Reason in refused.csv of a log that is analysed, though the manifest of its folder omits it."""
-
 LogKey = tuple[str, str]
 """Name of a log, and the key of its estimates in the store."""
 

@@ -498,7 +498,7 @@ def _advice(life: Life, service: Service, when: str) -> Iterator[str]:
     yield f"Service: {when or plain} ({rule})."
     risk = text.probability(service.risk) if service.risk >= 0 else ""
     if service.kind == "later":
-        if when not in ("", plain):  # something else is to be done first
+        if when not in ("", plain, text.NONE_SHOWN):  # something else is to be done first
             return
         shown = " for what the modes show" if life.undetermined else ""
         yield f"No service is needed within {text.km(life.horizon)}{shown}."

@@ -294,6 +294,11 @@ def parse_name(given: Mapping[str, str], key: str) -> str | None:
     return unicodedata.normalize("NFC", name)
 
 
+def utc_day(moment: datetime) -> date:
+    """Return the day of a moment in UTC, in which silences and days without a log are counted."""
+    return moment.astimezone(UTC).date()
+
+
 def parse_moment(given: Mapping[str, str], latest: datetime | None = None) -> datetime | None:
     """Read ``recorded_at``; None where it is not given.
 

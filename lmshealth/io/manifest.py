@@ -16,7 +16,6 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import datetime
 from difflib import get_close_matches
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -44,7 +43,7 @@ if TYPE_CHECKING:
 _MOST_LISTED = 3
 _DELIMITERS = ",;\t"
 MISSPELT = "unlike-key"  # reason of a column of a manifest that is probably misspelt
-_LIKE = 0.75  # likeness of words (difflib) from which one is taken for a misspelt other
+LIKE = 0.75  # likeness of words (difflib) from which one is taken for a misspelt other
 
 
 class Row(NamedTuple):
@@ -119,37 +118,49 @@ def _records(lines: list[str], delimiter: str) -> Iterator[tuple[str, list[str],
 def read_rows(path: Path, needed: Sequence[str]) -> "pd.DataFrame":
     """Read a table of estimates as text; `BadTable` if a column is missing or it cannot be read.
 
-    Empty cells beyond the columns, and empty rows, are left out.
+    Blank cells beyond the columns, and blank rows, are left out.
     """
     import pandas as pd  # late, as below: tables next to logs need none of it
 
-    read: Any = partial(pd.read_csv, path, dtype=str, keep_default_na=False)
-    table: pd.DataFrame
+    def read(**how: Any) -> pd.DataFrame:
+        found: pd.DataFrame = pd.read_csv(
+            io.BytesIO(content), dtype=str, keep_default_na=False, index_col=False, **how
+        )
+        return found
+
     try:
+        content = path.read_bytes()
         names = read(header=None, nrows=1).iloc[0].str.strip().tolist()
+    except (OSError, ValueError) as error:
+        raise BadTable(f"{path}: cannot be read as a table: {str(error).strip()}") from error
+    if missing := [name for name in needed if name not in names]:
+        hint = "; columns are separated by commas" if len(names) == 1 else ""
+        raise BadTable(f"{path}: no column {missing}; there are {names}{hint}")
+    if twice := repeated(filter(None, names)):
+        raise BadTable(f"{path}: columns {twice} are there twice; needed is one of each")
+    n = len(names)
+    try:
         with warnings.catch_warnings():
             warnings.simplefilter("error", pd.errors.ParserWarning)
             try:
-                table = read(index_col=False)
+                table = read()
             except pd.errors.ParserWarning:  # all rows are longer, as by a delimiter at their ends
-                table = read(header=0, names=[*range(len(names) + 1)])
-    except (OSError, ValueError) as error:
+                table = read(header=0, names=[*range(n + 1)])
+    except (ValueError, pd.errors.ParserWarning) as error:
         raise BadTable(f"{path}: cannot be read as a table: {str(error).strip()}") from error
-    if twice := repeated(filter(None, names)):
-        raise BadTable(f"{path}: columns {twice} are there twice; needed is one of each")
-    if (beyond := (table.iloc[:, len(names) :] != "").any(axis=1)).any():
-        what = f"{len(names) + 1} cells in {len(names)} columns"
-        raise BadTable(f"{path}, {lines(table, beyond)}: {what}")
-    table = table.iloc[:, : len(names)].set_axis(names, axis=1)
-    table = table[(table != "").any(axis=1)]
-    if missing := [name for name in needed if name not in table.columns]:
-        hint = "; columns are separated by commas" if len(table.columns) == 1 else ""
-        raise BadTable(f"{path}: no column {missing}; there are {list(table.columns)}{hint}")
+    filled = table.apply(lambda cells: cells.str.strip() != "")
+    if (beyond := filled.iloc[:, n:].any(axis=1)).any():
+        raise BadTable(f"{path}, {lines(table, beyond)}: {n + 1} cells in {n} columns")
+    table = pd.DataFrame(table.loc[filled.any(axis=1)].iloc[:, :n])
+    table.columns = pd.Index(names)
     return table
 
 
 def name_machine(path: Path, table: "pd.DataFrame") -> list[str]:
-    """Fill in a missing column stage, in place, and return a note of it."""
+    """Fill in a missing column stage, in place, and return a note of it.
+
+    `BadTable` if the column is there, and a cell of it is blank.
+    """
     if "stage" in table.columns:
         if (nameless := table["stage"].str.strip() == "").any():
             what = "stage is empty; needed is a name"
@@ -450,5 +461,5 @@ def _misspelt(names: set[str]) -> Iterator[tuple[str, str]]:
     """Yield the columns that are almost a key of the metadata without a column, and that key."""
     keys = [key for key in metadata_keys() if key not in names]
     for name in sorted(names.difference(metadata_keys(), ("file", ""))):
-        if near := get_close_matches(re.sub(r"\W+", "_", name.casefold()), keys, 1, _LIKE):
+        if near := get_close_matches(re.sub(r"\W+", "_", name.casefold()), keys, 1, LIKE):
             yield name, near[0]

@@ -215,7 +215,7 @@ def infer(
     BadStage, NotEnoughData, NotConverged
         As `fit_life`.
     BadQuestion
-        If the epochs are other ones.
+        If epochs are not increasing numbers of logs since the baseline, with the last at the end.
 
     Examples
     --------
@@ -233,16 +233,17 @@ def infer(
     >>> bool((low < [0.72, 0.87]).all() and (high > [0.72, 0.87]).all())
     True
     """
-    life = fit_life(history, stage, seed, chains=chains)
     if isinstance(epochs, int | np.integer):
-        return health_of(life, history, stage, epochs_to_publish(history, stage, int(epochs)))
-    chosen, last = [*map(int, epochs)], len(history.logs) - 1
-    if chosen != sorted(set(chosen)) or chosen[-1:] != [last] or chosen[0] < history.baseline:
-        raise BadQuestion(
-            f"epochs = {chosen}: needed are numbers of logs from {history.baseline} to {last} in "
-            f"order, the last of which is {last}: health is published up to now"
-        )
-    return health_of(life, history, stage, chosen)
+        chosen = epochs_to_publish(history, stage, int(epochs))
+    else:
+        chosen = tuple(map(int, epochs))
+        first, last = history.baseline, len(history.logs) - 1
+        if [*chosen] != sorted(set(chosen)) or chosen[-1:] != (last,) or chosen[0] < first:
+            raise BadQuestion(
+                f"epochs = {[*chosen]}: needed are numbers of logs from {first} to {last} in "
+                f"order, the last of which is {last}: health is published up to now"
+            )
+    return health_of(fit_life(history, stage, seed, chains=chains), history, stage, chosen)
 
 
 def epochs_to_publish(history: History, stage: Stage, most: int) -> tuple[int, ...]:

@@ -5,7 +5,6 @@ Everything here is a function of its arguments: no store, no file, no process, n
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from datetime import date
@@ -18,6 +17,7 @@ from lmshealth._private.serialize import fingerprint, seed_of
 from lmshealth._private.tables import fact
 from lmshealth.errors import BadQuestion, LmshealthError, NotEnoughData
 from lmshealth.io.log import Notice, Refusal
+from lmshealth.io.refusal import listed
 from lmshealth.life import constants, fleet_prior
 from lmshealth.life.health import Health, epochs_to_publish, health_of
 from lmshealth.life.posterior.exploration import LifeStart
@@ -264,12 +264,14 @@ def assess(
     """
     expect_stage(stage)
     logs = [*logs]
-    if epochs < 1 or seed < 0:
-        raise BadQuestion(f"epochs = {epochs}, seed = {seed}: needed at least 1, and at least 0")
-    contents = Counter(one.digest or (one.log, one.metadata.recorded_at) for one in logs)
-    if len(contents) < len(logs):
-        content, n = contents.most_common(1)[0]
-        raise BadQuestion(f"the log {content} is given {n} times; needed is each log once")
+    expect_settings(epochs, seed)
+    names: dict[object, list[str]] = {}
+    for one in logs:
+        content = one.digest or (one.log, one.metadata.recorded_at)
+        names.setdefault(content, []).append(one.log)
+    for same in names.values():
+        if len(same) > 1:
+            raise BadQuestion(f"{listed(same)} are one log; needed is each log once")
     machines = sorted({one.metadata.stage or "" for one in logs})
     if len(machines) > 1:
         named = ", ".join(machines)
@@ -277,6 +279,12 @@ def assess(
     own = work.of(machines[0]) if machines else work
     found, _ = assess_from(logs, stage, own, epochs=epochs, seed=seed)
     return replace(found, today=today)
+
+
+def expect_settings(epochs: int, seed: int) -> None:
+    """Raise `BadQuestion` where there is no epoch, or no such seed."""
+    if epochs < 1 or seed < 0:
+        raise BadQuestion(f"epochs = {epochs}, seed = {seed}: needed are at least 1 and at least 0")
 
 
 def assess_from(

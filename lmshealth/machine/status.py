@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
-from datetime import UTC, date, datetime, timedelta
+from datetime import date, datetime, timedelta
 from typing import Any, Literal
 
 import msgspec
@@ -13,7 +13,7 @@ from scipy.special import chdtrc, gammaincinv
 
 from lmshealth._private.arrays import FloatArray, finite_or_none
 from lmshealth._private.tables import FLAGS, NOTICES, fact, spell
-from lmshealth.io.log import WARNINGS, Notice, Refusal
+from lmshealth.io.log import WARNINGS, Notice, Refusal, utc_day
 from lmshealth.life.constants import LONE_NAMED, MIN_FIT
 from lmshealth.life.verdict import (
     NO_HEALTH,
@@ -284,7 +284,7 @@ def _last_day(status: Status) -> date:
     """Return the last day (UTC) on which a machine without a further log is not silent."""
     try:
         end = status.recorded_at + timedelta(days=status.silent_after_days or np.inf)
-        return end.astimezone(UTC).date()
+        return utc_day(end)
     except OverflowError:
         return date.max
 
@@ -348,7 +348,7 @@ def make_status(assessment: Assessment, summary: Summary) -> Status:
         service_by=service.by,
         inspect_by=service.inspect_by,
     )
-    return _judged(made, assessment.today or summary.recorded_at.date())
+    return _judged(made, assessment.today or utc_day(summary.recorded_at))
 
 
 def _silent_after(moments: Sequence[datetime]) -> float | None:
@@ -357,7 +357,7 @@ def _silent_after(moments: Sequence[datetime]) -> float | None:
     None with logs of a single day. Several logs of one day are a single one here.
     """
     n = constants.SILENT_INTERVALS
-    days = sorted({one.date() for one in moments})[-n - 1 :]
+    days = sorted({utc_day(one) for one in moments})[-n - 1 :]
     return n * (days[-1] - days[0]).days / (len(days) - 1) if len(days) > 1 else None
 
 
@@ -370,9 +370,9 @@ def _judged(status: Status, today: date) -> Status:
         status,
         conditions=found,
         device_health=state,
-        days_without_log=max((today - status.recorded_at.astimezone(UTC).date()).days, 0),
+        days_without_log=max((today - utc_day(status.recorded_at)).days, 0),
         silent="silent" in found,
-        unknown_since=status.recorded_at.date() if unknown else None,
+        unknown_since=utc_day(status.recorded_at) if unknown else None,
         verdict=UNKNOWN if unknown else verdict,
         verdict_at_last_log=verdict,
         probability=None if unknown else status.probability,

@@ -444,13 +444,15 @@ def draw(result: Result, what: str = "", ax: Axes | None = None) -> Axes:
             case Log():
                 return plot_log(axes, result, what)
             case Modes():
-                return plot_modes(axes, result.select([names.index(what)]) if what else result)
+                own = [k for k, name in enumerate(names) if what in ("", name)]
+                return plot_modes(axes, result.select(own))
             case History():
                 return plot_frequencies(axes, result, None, what or names[0])
             case Track():
                 return plot_track(axes, result, what or names[0])
             case Health():
-                return plot_health(axes, _expect_fractions(result), what or names[0], None)
+                what = what or names[0]
+                return plot_health(axes, _expect_fraction(result, what), what, None)
             case Prognosis() if what not in ("", "any"):
                 # Laws begin at the baseline of their parameter.
                 begin = result.curve_quantiles[_MEDIAN, 0, names.index(what)]
@@ -469,9 +471,9 @@ def _parts(result: Any) -> list[str]:
     return list(found)
 
 
-def _expect_fractions(health: Health) -> Health:
-    """Refuse health in the units of a description, whose baselines it does not have."""
-    median = float(np.nanmax(health.latest(0.5), initial=0.0))
+def _expect_fraction(health: Health, parameter: str) -> Health:
+    """Refuse a parameter in the unit of its description, whose baseline health does not have."""
+    median = float(health.latest(0.5)[health.parameters.index(parameter)])
     if median > _MOST_SHARE:
         raise BadQuestion(
             f"{health.title()}: a median of {median:.4g} is no fraction of a baseline; plot "

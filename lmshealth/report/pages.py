@@ -17,7 +17,7 @@ import numpy as np
 from scipy.special import chdtrc
 
 from lmshealth._private.files import free_name, write_text
-from lmshealth.io.log import Refusal
+from lmshealth.io.log import Refusal, utc_day
 from lmshealth.life.constants import LONE_NAMED, MIN_FIT
 from lmshealth.life.fleet_prior import FleetPrior, LawPrior, Pace
 from lmshealth.life.health import Health
@@ -376,7 +376,7 @@ _WORDS = (
 def file_names(identities: Iterable[str]) -> dict[str, str]:
     """Name the pages of machines: valid on every file system and unique regardless of case.
 
-    A machine whose identity is such a name has that, whatever others are called.
+    A machine whose identity is such a name has that, unless another differs from it by case only.
     """
     taken = {"index", "how-to-read"}
     stems = {}
@@ -409,7 +409,7 @@ def write_index(
     script = read("index.js") if len(ranked) > constants.MANY_MACHINES else ""
     for words in _WORDS:
         script = script.replace(words, tr(words))
-    newest = max((one.recorded_at.date() for one in ranked), default=date.min)
+    newest = max((utc_day(one.recorded_at) for one in ranked), default=date.min)
     today = today or newest
     by_reason = [
         (reason, count, [one for one in refused if one.reason == reason][: constants.REFUSED_SHOWN])

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, get_args
 import numpy as np
 
 from lmshealth._private import tables
+from lmshealth.io.log import utc_day
 from lmshealth.report import constants
 from lmshealth.report.language import decimal, mark, mark_either, sentence, tr, tr_day, tr_either
 
@@ -98,8 +99,10 @@ def moment(when: datetime) -> str:
 
 
 def age(last: date, today: date) -> str:
-    """Return for how long there has been no log on a day."""
-    n = (today - last).days
+    """Return for how many days (UTC) there has been no log on a day; empty on that of the log."""
+    n = (today - (utc_day(last) if isinstance(last, datetime) else last)).days
+    if n < 1:
+        return ""
     return tr_either("no log for {n} day", "no log for {n} days", n).format(n=_grouped(n))
 
 
@@ -337,8 +340,8 @@ def headline(summary: Summary) -> str:
     A verdict whose last log is too old is that of then: the machine is unknown since.
     """
     if summary.unknown:
-        since = summary.recorded_at.date()
-        past = age(since, summary.today or since)
+        since = utc_day(summary.recorded_at)
+        past = age(summary.recorded_at, summary.today or since)
         return tr("Unknown since {day}: {past}", day=day(since), past=past)
     if summary.verdict == "healthy" and summary.step.kind in ("service-now", "overdue"):
         return tr("Healthy at the last log, but the service is due")
@@ -346,6 +349,10 @@ def headline(summary: Summary) -> str:
         return tr("Alarm: unexplained change of {names}", names=joined(map(spell, summary.alarmed)))
     words = verdict_text(summary)
     return words[0].upper() + words[1:]
+
+
+NONE_SHOWN = mark("none by what the modes show")
+"""No service by limits of which the modes do not determine some."""
 
 
 def service_on_day(summary: Summary) -> str:
@@ -364,7 +371,7 @@ def service_on_day(summary: Summary) -> str:
     if summary.service.kind == "later" and summary.step.kind in ("inspect", "find-cause"):
         return tr("open until the cause is found")
     if summary.service.kind == "later" and summary.step.partial:
-        return tr("none by what the modes show")
+        return tr(NONE_SHOWN)
     return words
 
 

@@ -13,6 +13,7 @@ import numpy as np
 
 from lmshealth._private.arrays import FloatArray, ReadOnly
 from lmshealth.io.log import covariates
+from lmshealth.io.manifest import LIKE
 from lmshealth.stage import constants
 from lmshealth.stage.description import ModeSpec, ParameterSpec, Stage
 from lmshealth.stage.identifiability import Identifiability, identifiability_of
@@ -327,7 +328,9 @@ def _searched(check: ModeCheck) -> Iterator[Diagnostic]:
 def _misspelt(stage: Stage) -> Iterator[tuple[str, str]]:
     """Yield covariates that are no key of logs, with the key that they nearly are."""
     for name in (one.name for one in stage.description.covariate if one.name not in covariates()):
-        yield from ((name, near) for near in get_close_matches(name, covariates(), 1))
+        # A name that contains a key is one of its own, such as that of another temperature.
+        if not any(key in name for key in covariates()):
+            yield from ((name, near) for near in get_close_matches(name, covariates(), 1, LIKE))
 
 
 def _share(value: float) -> str:

@@ -99,7 +99,8 @@ def read_maintenance_beside(
     logs: Iterable[str | Path], latest: datetime | None = None
 ) -> Maintenance:
     """Read the ``maintenance.csv`` in the folder of each log, as far as there is one."""
-    tables = [folder / _FILE for folder in sorted({Path(log).parent for log in logs})]
+    folders = {Path(log).parent.resolve(): Path(log).parent for log in logs}
+    tables = [folders[key] / _FILE for key in sorted(folders)]
     return _read([(path, shown(path)) for path in tables if os.path.lexists(path)], latest)
 
 

@@ -171,7 +171,8 @@ def read_drifts(
     to_numbers(path, table, ("drift", "drift_std", "travel_km"))
     to_moments(path, table, latest)
     # Without names of logs, those of one moment are told apart by what they state.
-    key = [*table.columns] if "log" not in table.columns else ["stage", "log", "mode"]
+    of_log = ["stage", "recorded_at", "log", "mode"]
+    key = of_log if "log" in table.columns else [*table.columns]
     if (again := table.duplicated(key, keep=False)).any():
         first = table[again].iloc[0]
         when = first["recorded_at"].isoformat()
@@ -246,6 +247,7 @@ def _check(path: Path, table: pd.DataFrame, stage: Stage | None) -> None:
         _refuse(path, table, name, ~(table[name] > 0), needed)
     named = table[table["mode"] != ""]
     alike = ["stage", "log", "source", "frequency_hz", "frequency_std_hz"]
+    alike += ["channel"] if "channel" in table.columns else []
     if (again := (table["mode"] == "") & table.duplicated(alike, keep=False)).any():
         first = table[again].iloc[0]
         raise BadTable(

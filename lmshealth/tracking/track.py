@@ -416,11 +416,11 @@ def _effects(state: TrackState) -> tuple[Effect, ...]:
 
 
 def accepted_estimates(history: History, track: Track, *, doubtful: bool = False) -> History:
-    """Return a history with the steps of its track and without its outliers, for lives.
+    """Return a history with the steps of its track and without its outliers, as `infer` needs it.
 
     A suspected step is among them: a life without it competes with those that have it. One log does
-    not show whether it is in error or the machine has changed since: if ``doubtful``, as lives have
-    it, ln f of the first log of the present baseline stay, and are `History.in_doubt`.
+    not show whether it is in error or the machine has changed since: if ``doubtful``, as `assess`
+    sets it, ln f of the first log of the present baseline stay, and are `History.in_doubt`.
 
     Examples
     --------

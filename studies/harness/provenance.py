@@ -27,6 +27,7 @@ _HERE = Path(__file__).resolve()
 # A part of a module is a name of it, all of it, or what runs when it is imported.
 _Part = tuple[Path, str]
 _Origins = dict[str, tuple[str, _Part | None]]
+_Needs = dict[str, _Part]  # parts by the names that code has for them
 _ALL, _RUN = "*", ""
 _MAIN = ast.unparse(ast.parse('__name__ == "__main__"'))
 _PROGRAMS = ("lmshealth/cli/*.py", "models/__main__.py")
@@ -146,8 +147,19 @@ def _needed(parts: set[_Part]) -> dict[Path, set[str]]:
 
     With each statement is what the names in it are.
     """
-    found: dict[Path, set[str]] = {}
-    seen, left = set[_Part](), list(parts)
+    found = dict[Path, set[str]]()
+    for module, code, needs in _reached(parts):
+        meanings = (f"{written}={_meaning(part)}" for written, part in needs.items())
+        found.setdefault(module, set()).add(" ".join([code, *sorted(meanings)]))
+    return found
+
+
+def _reached(parts: set[_Part], *, imports: bool = True) -> Iterator[tuple[Path, str, _Needs]]:
+    """Yield the statements that parts of modules need, directly or not, each with its module.
+
+    With imports what runs when the modules are imported is among them.
+    """
+    seen, modules, left = set[_Part](), set[Path](), list(parts)
     while left:
         module, name = part = left.pop()
         # Names that the package gathers count in their own modules. This module records by which
@@ -157,39 +169,51 @@ def _needed(parts: set[_Part]) -> dict[Path, set[str]]:
         seen.add(part)
         if name in _WORDS:
             continue
-        if module not in found:
-            found[module] = set()
+        if imports and module not in modules:
+            modules.add(module)
             # Whoever imports from a package runs all that it begins with, and what this imports.
             left += [(module.parent / "__init__.py", _RUN), (module, _RUN)]
         for code, needs in _statements(module).get(name, ()):
+            left += needs.values()
             if code:
-                found[module].add(f"{code} {' '.join(sorted(map(_meaning, needs)))}")
-            left += needs
-    return {module: codes for module, codes in found.items() if codes}
+                yield module, code, needs
 
 
 @cache
 def _meaning(part: _Part) -> str:
-    """Return a name with the digest of its definition, wherever that is; empty if it has none."""
-    module, name = part
-    if name in (_ALL, _RUN) or not module.exists():
+    """Return the digest of all code that a name depends on, wherever it is defined."""
+    if part[1] in (_ALL, _RUN, *_WORDS):
         return ""
-    rows = _statements(module).get(name, ())
-    # A name that is imported is what its definition is.
-    codes = sorted(code or "".join(map(_meaning, needs)) for code, needs in rows)
-    return f"{name}:{hashlib.sha256(''.join(codes).encode()).hexdigest()[:16]}" if codes else ""
+    rows = {
+        " ".join([code, *sorted(f"{name}={_definition(own)}" for name, own in needs.items())])
+        for _, code, needs in _reached({part}, imports=False)
+    }
+    return hashlib.sha256("".join(sorted(rows)).encode()).hexdigest()[:16]
 
 
 @cache
-def _statements(module: Path) -> dict[str, list[tuple[str, set[_Part]]]]:
+def _definition(part: _Part) -> str:
+    """Return the digest of the definition of a name alone."""
+    module, name = part
+    is_one = module.exists() and name not in (_ALL, _RUN, *_WORDS)
+    # A name that is imported is what its definition is.
+    codes = sorted(
+        code or "".join(map(_definition, needs.values()))
+        for code, needs in (_statements(module).get(name, ()) if is_one else ())
+    )
+    return hashlib.sha256("".join(codes).encode()).hexdigest()[:16]
+
+
+@cache
+def _statements(module: Path) -> dict[str, list[tuple[str, _Needs]]]:
     """Return the code of each name of a module, with the parts that it needs."""
-    found = defaultdict[str, list[tuple[str, set[_Part]]]](list)
+    found = defaultdict[str, list[tuple[str, _Needs]]](list)
     origins = _origins(_tree(module).body)
     for name, (code, part) in origins.items():
         for one in (name, _ALL):
-            found[one].append((code, {part} if part else set()))
+            found[one].append((code, {name: part} if part else {}))
         # What a module registers when it is imported counts for whoever imports it.
-        found[_RUN].append(("", {(part[0], _RUN)} if part else set()))
+        found[_RUN].append(("", {name: (part[0], _RUN)} if part else {}))
     for statement in _tree(module).body:
         test = ast.unparse(statement.test) if isinstance(statement, ast.If) else ""
         if isinstance(statement, ast.Import | ast.ImportFrom) or test == _MAIN:
@@ -197,7 +221,11 @@ def _statements(module: Path) -> dict[str, list[tuple[str, set[_Part]]]]:
         names = _defined(statement)
         if test != "TYPE_CHECKING" and (not names or _registers(statement)):
             names.add(_RUN)
-        row = _dump(statement), _uses(module, statement, origins)
+        uses = _uses(module, statement, origins)
+        # What a module makes of its own place or name is of that module.
+        is_placed = uses.keys() & {"__file__", "__name__", "__package__"}
+        place = f"{module.parent.name}/{module.name}" if is_placed else ""
+        row = _dump(statement) + place, uses
         for name in {*names, _ALL}:
             found[name].append(row)
     return dict(found)
@@ -212,27 +240,31 @@ def _dump(statement: ast.stmt) -> str:
     return ast.dump(statement)
 
 
-def _uses(module: Path, statement: ast.stmt, origins: _Origins) -> set[_Part]:
-    """Return the names that a statement needs; of an imported module those after its dot."""
+def _uses(module: Path, statement: ast.stmt, origins: _Origins) -> _Needs:
+    """Return the parts that a statement needs; of an imported module those after its dot."""
     nodes = list(ast.walk(statement))
     inner = {name: part for name, (_, part) in _origins(nodes).items() if part}
     known = {name: part for name, (_, part) in origins.items() if part} | inner
     modules = {name: file for name, (file, of) in known.items() if of == _ALL}
     dotted = {
-        id(node.value): (modules[node.value.id], node.attr)
+        id(node.value): (node.value.id, node.attr)
         for node in nodes
         if isinstance(node, ast.Attribute)
         and isinstance(node.value, ast.Name)
         and node.value.id in modules
     }
     names = {node.id for node in nodes if isinstance(node, ast.Name) and id(node) not in dotted}
-    parts = {_source(_words(file), attribute) for file, attribute in dotted.values()}
-    parts |= {part for name, part in inner.items() if name in names or part[1] != _ALL}
+    needs = {name: (module, name) for name in names}
+    needs |= {n: part for n, part in inner.items() if n in names or part[1] != _ALL}
+    for name, attribute in dotted.values():
+        if part := _source(_words(modules[name]), attribute):
+            needs[f"{name}.{attribute}"] = part
     words = {node.value for node in nodes if isinstance(node, ast.Constant)}
     if "-m" in words:
         # A program is started, whose commands are imported by their names.
-        parts |= {(file, _ALL) for pattern in _PROGRAMS for file in PROJECT.glob(pattern)}
-    return {(module, name) for name in names} | {part for part in parts if part}
+        programs = (file for pattern in _PROGRAMS for file in PROJECT.glob(pattern))
+        needs |= {file.name: (file, _ALL) for file in programs}
+    return needs
 
 
 def _registers(statement: ast.stmt) -> bool:

@@ -17,7 +17,7 @@ from tests.tools.columns import pages
 PACKAGE = Path(__file__).parents[2] / "lmshealth"
 # Place of the reason among the arguments of what makes a refusal.
 MAKERS = {"Unusable": 0, "BadLog": 1, "Refusal": 1, "Rejection": 0, "Label": 1}
-NAMES = {"reason", "why", "nothing", "NOT_LISTED", "NO_MODE_REASON"}
+NAMES = {"reason", "why", "nothing", "NO_MODE_REASON"}
 CODE = re.compile(r"[a-z]+(-[a-z]+)*")
 
 

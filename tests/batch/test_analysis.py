@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 import lmshealth
-from lmshealth.errors import BadStage, BadTable, NotEnoughData
+from lmshealth import examples
+from lmshealth.errors import BadQuestion, BadStage, BadTable, NotEnoughData
 from lmshealth.io.column_map import column_map
 
 EXPORT = {"columns": {"acc_pitch_m_s2": "a2"}}
@@ -72,6 +73,33 @@ def test_a_log_of_another_machine_is_refused(logs: Path) -> None:
     """As in a run: its modes are not those of the description."""
     with pytest.raises(NotEnoughData, match=r"no description matches stage 'AX-3-Y'"):
         lmshealth.analyse(logs, lmshealth.load_stage("lms-x"), columns=EXPORT)
+
+
+def test_notices_are_of_the_machine(logs: Path, tmp_path: Path) -> None:
+    """A refused baseline of another machine, and a bad column, are no logs that it has lost."""
+    folder = tmp_path / "logs"
+    shutil.copytree(logs, folder)
+    other = (folder / "0.csv").read_text().replace("AX-3-Y", "AX-3-X").replace("km: 0", "km: 5")
+    (folder / "x.csv").write_text(other)
+    (folder / "torn.csv").write_text("# stage: AX-3-Y\nno log\n")
+    rows = "0.csv,,false\n1.csv,,false\nx.csv,,true\ntorn.csv,AX-3-Y,\n"
+    (folder / "manifest.csv").write_text(f"file,stage,baseline,travel_kms\n{rows}")
+    found = lmshealth.analyse(folder, lmshealth.load_stage("lms-y"), columns=EXPORT)
+    assert {one.reason for one in found.refused} >= {"no-stage", "unlike-key"}
+    assert [Path(one.log).name for one in found.lost] == ["torn.csv"]
+    assert [one.where for one in found.notices if one.code == "baseline-refused"] == []
+
+
+def test_questions_out_of_range_are_refused_before_a_log_is_read(tmp_path: Path) -> None:
+    """No epoch, no such seed, and a log that is there twice."""
+    stage = lmshealth.load_stage("lms-y")
+    wrong: dict[str, Any]
+    for wrong in ({"epochs": 0}, {"seed": -1}):
+        with pytest.raises(BadQuestion, match="needed are at least 1 and at least 0"):
+            lmshealth.analyse(tmp_path / "none", stage, **wrong)
+    readings = examples.readings()[:2]
+    with pytest.raises(BadQuestion, match=r"log-0001.h5, log-0001.h5 are one log; needed is each"):
+        lmshealth.assess([*readings, readings[0]], stage)
 
 
 def test_files_are_analysed_with_the_maintenance_beside_them(logs: Path, tmp_path: Path) -> None:

@@ -135,7 +135,7 @@ def test_logs_of_the_future_are_refused_unless_allowed(tmp_path: Path) -> None:
     assert read_drifts(drifts, latest=LAST_MOMENT)[0][0].recorded_at[0].year == 2062
 
 
-@pytest.mark.parametrize("end", [",\n", ",\n,,,,,,,,,,,\n", "\n,,,,,,,,,,,\n,,,,,,,,,,,\n"])
+@pytest.mark.parametrize("end", [",\n", " , \n , ,,,,,,,,,,\n", "\n,,,,,,,,,,,\n,,,,,,,,,,,\n"])
 def test_empty_cells_at_the_ends_of_lines_and_empty_rows_are_left_out(
     tmp_path: Path, end: str
 ) -> None:
@@ -243,6 +243,11 @@ def test_assumptions_are_noted(tmp_path: Path) -> None:
         (HEAD + row().replace("AX-1", " "), "line 2: stage is empty; needed is a name"),
         (HEAD.replace("source", "mode") + row(), "columns ['mode'] are there twice"),
         (HEAD + row().replace("\n", ",9\n"), "line 2: 13 cells in 12 columns"),
+        (HEAD + row().replace("\n", ",,\n"), "cannot be read as a table: Length of header"),
+        (
+            "recorded_at;frequency_hz;frequency_std_hz\n2026-03-01T06:00:00Z;126,4;0,1\n",
+            "there are ['recorded_at;frequency_hz;frequency_std_hz']; columns are separated by com",
+        ),
         (HEAD + row() + row(log="b", day=2).replace("\n", ",\n"), "Expected 12 fields in line 3"),
         (HEAD + row() + row(mode="pitch", km=11), "log a has travel_km 10 and 11"),
         (HEAD + row(rho=1.0), "correlation_f_zeta reaches 1"),
