@@ -93,10 +93,9 @@ def test_notices_are_of_the_machine(logs: Path, tmp_path: Path) -> None:
 def test_questions_out_of_range_are_refused_before_a_log_is_read(tmp_path: Path) -> None:
     """No epoch, no such seed, and a log that is there twice."""
     stage = lmshealth.load_stage("lms-y")
-    wrong: dict[str, Any]
-    for wrong in ({"epochs": 0}, {"seed": -1}):
+    for epochs, seed in ((0, 0), (1, -1)):
         with pytest.raises(BadQuestion, match="needed are at least 1 and at least 0"):
-            lmshealth.analyse(tmp_path / "none", stage, **wrong)
+            lmshealth.analyse(tmp_path / "none", stage, epochs=epochs, seed=seed)
     readings = examples.readings()[:2]
     with pytest.raises(BadQuestion, match=r"log-0001.h5, log-0001.h5 are one log; needed is each"):
         lmshealth.assess([*readings, readings[0]], stage)
