@@ -432,7 +432,7 @@ def accepted_estimates(history: History, track: Track, *, doubtful: bool = False
     >>> track = lmshealth.track(history, stage)
     >>> accepted = lmshealth.accepted_estimates(history, track, doubtful=True)
     >>> health = lmshealth.infer(accepted, stage, seed=1, chains=False)
-    >>> round(health.latest(0.5)[0], 2)
+    >>> print(f"{health.latest(0.5)[0]:.2f}")
     0.71
     """
     ln_f, ln_zeta, cov = map(np.array, (history.ln_frequency, history.ln_damping, history.cov))
