@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from studies.harness import full, provenance
-from tests.test_resume import CACHES
+from tests.test_resume import forget
 
 STUDY = '''"""Is this fake study run?"""
 
@@ -82,12 +82,6 @@ def test_all_are_recorded_and_failures_are_named(
     forget()
     assert full.run_all(fake, ("group",), kept) == failed
     assert runs(fake)[4:] == ["second", "third"]
-
-
-def forget() -> None:
-    """Forget what was known of all code."""
-    for known in CACHES:
-        known.cache_clear()
 
 
 def test_records_of_other_code_are_not_fresh(tmp_path: Path) -> None:

@@ -38,17 +38,17 @@ def outcomes(rows):
     return len(rows)
 '''
 TASKS = [("a", k) for k in range(5)] + [("b", 0)]
-CACHES = [getattr(provenance, f"_{name}") for name in ("digest", "tree", "statements", "meaning")]
-CACHES.append(provenance._definition)
+
+
+def forget() -> None:
+    """Forget what was known of all code."""
+    for name in ("digest", "tree", "statements", "meaning", "definition"):
+        getattr(provenance, f"_{name}").cache_clear()
 
 
 @pytest.fixture
 def written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
     """Write a script as a module, and forget what was known of all code."""
-
-    def forget() -> None:
-        for known in CACHES:
-            known.cache_clear()
 
     def write(text: str) -> ModuleType:
         path = tmp_path / "script.py"

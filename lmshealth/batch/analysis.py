@@ -1,7 +1,7 @@
 """Analysis of one machine from its logs in one call."""
 
-from collections.abc import Iterable
-from dataclasses import replace
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
 from datetime import datetime
 from pathlib import Path
 
@@ -11,6 +11,7 @@ from lmshealth.io.column_map import ColumnsGiven, column_map
 from lmshealth.io.log import Log, Notice, Refusal
 from lmshealth.io.manifest import (
     NOT_LOGS,
+    Manifest,
     copy_error,
     find_logs,
     read_manifest,
@@ -23,6 +24,7 @@ from lmshealth.modal.log_estimates import LogEstimates
 from lmshealth.signal.readings import loop_error
 from lmshealth.stage.description import Stage, expect_stage, why_unmatched
 from lmshealth.tracking.maintenance import (
+    Maintenance,
     baseline_notices,
     read_maintenance,
     read_maintenance_beside,
@@ -75,18 +77,53 @@ def analyse(
     """
     expect_stage(stage)
     expect_settings(epochs, seed)
-    refused, found = list[Refusal](), list[LogEstimates]()
+    used, given = column_map(columns), _given(logs, latest)
+    refused, found = [*given.refused], list[LogEstimates]()
+    seen: dict[str, tuple[str, dict[str, str]]] = {}
+    for one in given.logs:
+        overrides: dict[str, str] = {}
+        try:
+            log = one
+            if isinstance(log, Path):
+                overrides = given.manifests[log].overrides(log)
+                log = read_log(log, columns=used, overrides=overrides, latest=latest)
+            if log.digest in seen:
+                raise copy_error(log.name, overrides, *seen[log.digest])
+            seen[log.digest] = log.name, overrides
+            found.append(_estimates(log, stage))
+        except BadLog as error:
+            is_declared = isinstance(one, Path) and given.manifests[one].is_baseline(one)
+            machine = log.metadata.stage if isinstance(log, Log) else overrides.get("stage")
+            refusal = Refusal(error.log, error.reason, error.detail, baseline=is_declared)
+            refused.append(replace(refusal, machine=machine or ""))
+    if not found:
+        why = "; ".join(f"{one.log}: {one.detail}" for one in refused[:3]) or "none is given"
+        raise NotEnoughData(f"no log can be used: {why}")
+    made = assess(found, stage, work=given.work, epochs=epochs, seed=seed)
+    return _with_refusals(made, refused, given.work)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Given:
+    """Logs to analyse, of copies first that in a manifest, and what their folders state."""
+
+    logs: list[Path | Log]
+    manifests: dict[Path, Manifest]  # of each path
+    work: Maintenance
+    refused: tuple[Refusal, ...] = ()  # files that are no logs, and rows of manifests
+
+
+def _given(logs: str | Path | Iterable[str | Path | Log], latest: datetime | None) -> _Given:
+    """Find the logs of a folder, or take those that are given, with the tables beside them."""
     given: list[Path | Log]
-    used = column_map(columns)
     if isinstance(logs, str | Path):
         folder = Path(logs)
         manifest, work = read_manifest(folder), read_maintenance(folder, latest=latest)
         listed = find_logs(folder, manifest=manifest)
-        given = [*listed.logs]
-        refused += [*listed.refused, *manifest.refused]
+        given, refused = [*listed.logs], (*listed.refused, *manifest.refused)
         manifests = dict.fromkeys(listed.logs, manifest)
     else:
-        given = [one if isinstance(one, Log) else Path(one) for one in logs]
+        given, refused = [one if isinstance(one, Log) else Path(one) for one in logs], ()
         paths = [one for one in given if isinstance(one, Path)]
         beside = {path.parent: path for path in paths}
         of_folder = {folder: read_manifest_beside(path) for folder, path in beside.items()}
@@ -96,33 +133,21 @@ def analyse(
     def is_unlisted(one: Path | Log) -> bool:
         return isinstance(one, Path) and not manifests[one].names(one)
 
-    seen: dict[str, tuple[str, dict[str, str]]] = {}
-    # Of several copies the one in a manifest is analysed: only that one has its metadata.
-    for one in sorted(given, key=is_unlisted):
-        overrides: dict[str, str] = {}
-        try:
-            log = one
-            if isinstance(log, Path):
-                overrides = manifests[log].overrides(log)
-                log = read_log(log, columns=used, overrides=overrides, latest=latest)
-            if log.digest in seen:
-                raise copy_error(log.name, overrides, *seen[log.digest])
-            seen[log.digest] = log.name, overrides
-            stated = log.metadata.stage or log.metadata.description
-            if stated is not None and not stage.matches(log.metadata):
-                raise BadLog(log.name, "no-stage", why_unmatched(log.metadata, [stage]))
-            modes = identify(log, stage)
-            own = log.name, log.digest, log.metadata, modes, loop_error(log)
-            found.append(LogEstimates(*own, sample_rate=log.sample_rate))
-        except BadLog as error:
-            is_declared = isinstance(one, Path) and manifests[one].is_baseline(one)
-            machine = log.metadata.stage if isinstance(log, Log) else overrides.get("stage")
-            refusal = Refusal(error.log, error.reason, error.detail, baseline=is_declared)
-            refused.append(replace(refusal, machine=machine or ""))
-    if not found:
-        why = "; ".join(f"{one.log}: {one.detail}" for one in refused[:3]) or "none is given"
-        raise NotEnoughData(f"no log can be used: {why}")
-    made = assess(found, stage, work=work, epochs=epochs, seed=seed)
+    # Of several copies the first is analysed; only one in a manifest has its metadata.
+    return _Given(sorted(given, key=is_unlisted), manifests, work, refused)
+
+
+def _estimates(log: Log, stage: Stage) -> LogEstimates:
+    """Identify the modes of a log; `BadLog` where the description is that of another machine."""
+    stated = log.metadata.stage or log.metadata.description
+    if stated is not None and not stage.matches(log.metadata):
+        raise BadLog(log.name, "no-stage", why_unmatched(log.metadata, [stage]))
+    own = log.name, log.digest, log.metadata, identify(log, stage), loop_error(log)
+    return LogEstimates(*own, sample_rate=log.sample_rate)
+
+
+def _with_refusals(made: Assessment, refused: Sequence[Refusal], work: Maintenance) -> Assessment:
+    """Add refusals of logs and rows, and notices of those that concern the machine."""
     machine = made.history.stage
     mine = [one for one in refused if one.machine in ("", machine)]
     instead = baseline_notices(mine, made.history.logs[made.history.baseline])

@@ -170,7 +170,7 @@ def read_drifts(
     notes = name_machine(path, table)
     to_numbers(path, table, ("drift", "drift_std", "travel_km"))
     to_moments(path, table, latest)
-    # Without names of logs, those of one moment are told apart by what they state.
+    # Without a column log, a drift is there twice only where all cells of two rows are equal.
     of_log = ["stage", "recorded_at", "log", "mode"]
     key = of_log if "log" in table.columns else [*table.columns]
     if (again := table.duplicated(key, keep=False)).any():

@@ -81,7 +81,7 @@ def code_of(work: Callable[..., Any], also: tuple[str, ...] = ()) -> str:
     directly or not, what modules run when they are imported for it, the tables and descriptions
     whose file or folder this code names, and the versions of libraries. Comments, docstrings,
     layout, threads, code that it does not reach, and the module in which a definition stands do
-    not count: what a name is, does.
+    not count; which definition a name has does.
     """
     return _digest(_script(work), bare(work).__qualname__, also)
 
@@ -159,7 +159,7 @@ def _reached(parts: set[_Part], *, imports: bool = True) -> Iterator[tuple[Path,
 
     With imports what runs when the modules are imported is among them.
     """
-    seen, modules, left = set[_Part](), set[Path](), list(parts)
+    seen, left = set[_Part](), list(parts)
     while left:
         module, name = part = left.pop()
         # Names that the package gathers count in their own modules. This module records by which
@@ -169,8 +169,7 @@ def _reached(parts: set[_Part], *, imports: bool = True) -> Iterator[tuple[Path,
         seen.add(part)
         if name in _WORDS:
             continue
-        if imports and module not in modules:
-            modules.add(module)
+        if imports:
             # Whoever imports from a package runs all that it begins with, and what this imports.
             left += [(module.parent / "__init__.py", _RUN), (module, _RUN)]
         for code, needs in _statements(module).get(name, ()):

@@ -62,7 +62,8 @@ LIVES = {
 }  # fmt: skip
 FEW, QUICK_LIVES, QUICK = 30, 2, ("preload, late", "yaw alone, 2 %")
 ALL = "preload, all courses"
-# Lives of the control.
+# Lives of the control. Whoever changes them, or `by_row`, deletes the key ``control`` of the
+# record: the digest that `of_control` compares does not have them.
 EARLIER = {
     **dict.fromkeys(WEARING, 12), **dict.fromkeys(LONE, 8), **dict.fromkeys(HEALTHY, 16),
     "mount, loosening": 100, "opposite": 32,
