@@ -181,7 +181,7 @@ def make_prognosis(
         remaining=np.column_stack([remaining, remaining.min(axis=1)]),
         usage=(usage := 12e3 * np.exp(rng.normal(0, 0.08, n))),
         usage_now=usage,
-        half=remaining.min(axis=1) / 2,
+        half=remaining / 2,
         horizon=horizon,
         health=np.column_stack(present),
         curve_travel=grid + history.travel[0],

@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from studies.harness import summary
+from studies.harness import front_page, summary
 from studies.harness.claims import Claim, counted, covered
 from studies.harness.figures import draw, shown
 from studies.harness.study import Study
@@ -121,6 +121,19 @@ def test_claims_are_judged() -> None:
     assert not covered("90 %", [row, row | {"holds": True}]).met
     assert covered("90 %", [row | {"holds": True}]).met
     assert counted("of", 10, 10) == Claim("of", "10 of 10", "69.2 to 100.0 % (95 %)")
+
+
+def test_a_pool_is_no_kind() -> None:
+    """A share of kinds together is beside their range, and required where it is named."""
+    claims = [counted(f"held: {kind}", 5 + k, 20) for k, kind in enumerate("abcdefghi")]
+    pooled = counted("held: all kinds", 0, 180, met=False)
+    text = front_page.figure([*claims, pooled], "held: ", pool="all kinds")
+    assert text == (
+        "held: 25.0 to 65.0 % of 9 kinds, least a (5 of 20); 0 not met; "
+        "all kinds, together: 0 of 180 **not met**"
+    )
+    with pytest.raises(ValueError, match="all kinds"):
+        front_page.figure(claims, "held: ", pool="all kinds")
 
 
 def test_shares_are_drawn(tmp_path: Path) -> None:

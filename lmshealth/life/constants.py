@@ -120,7 +120,7 @@ MAX_EPOCHS = 40
 """Epochs of which health is published by default: a trend shows no more detail."""
 # Convergence. Four chains are the least that [Vehtari2021] recommends for R-hat, and 1.01 is its
 # recommended limit; 50 autocorrelation times are what the authors of emcee require for an estimate
-# of that time [ForemanMackey2013]. An epoch that needs more steps is marked as not converged.
+# of that time [ForemanMackey2013]. A fit that needs more steps ends with `NotConverged`.
 N_ENSEMBLES = 4
 MIN_AUTOCORRELATION_TIMES = 50
 MAX_R_HAT = 1.01

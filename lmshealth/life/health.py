@@ -16,7 +16,7 @@ from lmshealth._private.serialize import stream
 from lmshealth._private.tables import TABLES
 from lmshealth.errors import BadQuestion, BadStage, NotEnoughData
 from lmshealth.life import constants
-from lmshealth.life.posterior.data import clock_and_steps, with_clock
+from lmshealth.life.posterior.data import clock_and_steps, clock_travel, with_clock
 from lmshealth.life.posterior.fit import LifePosterior, LoneMode, fit_life
 from lmshealth.life.posterior.likelihood import default_scatter
 from lmshealth.stage.constants import INFORMED
@@ -357,8 +357,11 @@ def infer_drifts(
     """
     if not stage.parameters:
         raise BadStage(f"{stage.name}: no [[parameter]] to infer")
-    has_odometer = bool(np.isfinite(drifts.travel).all())
-    if not has_odometer:
+    seconds = np.array([moment.timestamp() for moment in drifts.recorded_at])
+    travel = clock_travel(drifts.travel, seconds, stage)
+    drifts = replace(drifts, travel=travel)
+    has_clock = bool(np.isfinite(travel).all())
+    if not has_clock:
         # The state of a law follows from its travel, which is not known without an odometer.
         stage = stage.with_laws({one.name: None for one in stage.parameters})
         drifts = replace(drifts, travel=np.arange(1.0, 1 + len(drifts.recorded_at)))
@@ -373,20 +376,19 @@ def infer_drifts(
             f"{drifts.stage}: no epoch has a drift of any of the modes {list(stage.informative)} "
             "with a standard deviation above 0; those of the baseline itself have none"
         )
-    found = []
-    for k in [usable[i] for i in _thinned(len(usable), epochs)]:
+    found, published = [], [usable[i] for i in _thinned(len(usable), epochs)]
+    for k in published:
         history = histories[k]
         assert history is not None
         own = (*np.atleast_1d(seed).tolist(), k)
         life = fit_life(history, stage, own, chains=False, min_logs=2)
         found.append(health_of(life, history, stage, [1]))
-    names = ("travel", "chains", "informed", "prior_width", "identifiable", "correlation", "fit")
+    names = ("chains", "informed", "prior_width", "identifiable", "correlation", "fit")
     joined: dict[str, Any] = {
         name: np.concatenate([getattr(one, name) for one in found])
         for name in (*names, "at_edge", *CHECKS)
     }
-    if not has_odometer:
-        joined["travel"] = np.full(len(found), np.nan)
+    joined["travel"] = travel[published] if has_clock else np.full(len(found), np.nan)
     return replace(
         found[-1],
         recorded_at=tuple(one.recorded_at[0] for one in found),

@@ -66,8 +66,8 @@ class Prognosis(Result):
     remaining: FloatArray
     usage: FloatArray
     usage_now: FloatArray
-    # Draws of the travel in m, by the laws, at which half of ln(health now / limit) is lost, of the
-    # limit that is reached first, ``(n_draws,)``.
+    # Draws of the travel in m, by the laws, at which half of ln(health now / limit) is lost,
+    # ``(n_draws, n)``.
     half: FloatArray
     horizon: float  # travel in m beyond which nothing is published
     # Draws of the parameters now in their units, ``(n_draws, n)``: those of `Health`, in its order.
@@ -95,7 +95,8 @@ class Prognosis(Result):
             self,
             ("limits", n),
             ("remaining", n_draws, n),
-            ("usage usage_now half", n_draws),
+            ("usage usage_now", n_draws),
+            ("half", n_draws, n - 1),
             ("health", self.health.shape[0], n - 1),
             ("curve_quantiles", 5, self.curve_travel.size, n - 1),
         )
@@ -241,11 +242,10 @@ def passages(
     now: float,
     horizon: float,
 ) -> tuple[FloatArray, FloatArray]:
-    """Draw the travel in m left to each limit, and to the first of them; and `half` of `Prognosis`.
+    """Draw `remaining` and `half` of `Prognosis`, in the order of the draws.
 
     For parameters with a limit, and their indices; `now` is the travel in m since the baseline, and
-    the horizon is in m from now. Shapes ``(n_draws, n_limits + 1)`` and ``(n_draws,)``, in the
-    order of the draws.
+    the horizon is in m from now.
     """
     parts = []
     for one, off, rate in life.by_scenario():
@@ -264,13 +264,11 @@ def passages(
                 left, half = _beyond_laws(rng, path.law, left, half, now=now, proven=proven)
             columns.append(left)
             halves.append(half)
-        first = np.argmin(columns, axis=0)[None]
-        half = np.take_along_axis(np.array(halves), first, axis=0)[0]
-        found = np.column_stack([*columns, np.min(columns, axis=0), half])
+        found = np.column_stack([*columns, np.min(columns, axis=0), *halves])
         parts.append(found.reshape(life.rate.shape[0], one.n_mixture_draws, -1))
     joined = np.concatenate(parts, axis=1)
-    joined = joined.reshape(-1, joined.shape[-1])
-    return joined[:, :-1], joined[:, -1]
+    remaining, half = np.split(joined.reshape(-1, joined.shape[-1]), [len(limited) + 1], axis=1)
+    return remaining, half
 
 
 def rate_std(law: Law) -> float:

@@ -51,7 +51,13 @@ from lmshealth.tracking.maintenance import (
     maintenance_notices,
     restored,
 )
-from lmshealth.tracking.track import Track, accepted_estimates, outlier_refusals, track
+from lmshealth.tracking.track import (
+    Track,
+    accepted_estimates,
+    known_shifts,
+    outlier_refusals,
+    track,
+)
 
 _NAMELESS = ("ambiguous", "unconfirmed")  # reasons of estimates whose name is not certain
 
@@ -132,11 +138,12 @@ class Assessment:
         if track is None or self.alarmed or n_logs >= self.stage.description.baseline.logs:
             return {}
         drift, variance = track.drift[-1].copy(), np.diagonal(track.drift_cov[-1]).copy()
-        for mode in (mode for epoch, mode in track.outliers if epoch == len(track.logs) - 1):
-            own = history.columns(mode)
+        last = len(track.logs) - 1
+        for mode in (mode for epoch, mode in track.outliers if epoch == last):
+            own, (shift,) = history.columns(mode), known_shifts(history, track, self.stage, [last])
             there = np.isfinite(history.ln_frequency[-1, own])
             k, column = track.modes.index(mode), own[int(there.argmax())]
-            drift[k] = history.ln_frequency[-1, column] - track.ln_frequency[-2, k]
+            drift[k] = (history.ln_frequency[-1] - shift)[column] - track.ln_frequency[-2, k]
             variance[k] = history.cov[-1, column, column] + track.ln_frequency_std[-2, k] ** 2
         with np.errstate(divide="ignore", invalid="ignore"):
             ratios = np.abs(drift) / np.sqrt(variance)
@@ -310,7 +317,7 @@ def assess_from(
     by_log = {reading.log: reading for reading in readings}
     used = [by_log[log] for log in history.logs]
     doubt = doubt_of_clock(history, made.refused) or doubt_of_names(stage, history, tracked, used)
-    refused = (*made.refused, *outlier_refusals(history, tracked))
+    refused = (*made.refused, *outlier_refusals(history, tracked, stage))
     judgement = judge(stage, history, None, tracked, doubt=doubt)
     made = replace(made, track=tracked, doubt=doubt, refused=refused, judgement=judgement)
     if doubt or not stage.parameters:

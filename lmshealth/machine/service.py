@@ -99,6 +99,7 @@ def without_limits(prognosis: Prognosis | None, restored: Collection[str]) -> Pr
         parameters=tuple(prognosis.parameters[k] for k in (*kept, -1)),
         limits=prognosis.limits[[*kept, -1]],
         remaining=np.column_stack([parts, parts.min(axis=1)]),
+        half=prognosis.half[:, kept],
         health=prognosis.health[:, kept],
         curve_quantiles=prognosis.curve_quantiles[:, :, kept],
         laws=tuple(law for law in prognosis.laws if law.parameter not in restored),
@@ -139,7 +140,8 @@ def _inspection(prognosis: Prognosis, decision: Decision) -> tuple[float, float]
     risk = constants.INSPECTION_RISK * (decision.accepted or MAX_RISK)
     left, n = prognosis.remaining[:, -1], prognosis.usage.size
     ends = (left > 0) & (left <= prognosis.horizon)
-    half, left = prognosis.half[ends], left[ends]
+    first = prognosis.remaining[ends, :-1].argmin(axis=1)  # limit
+    half, left = prognosis.half[ends, first], left[ends]
     half = np.where(half < left, half, left / 2)  # a deviation may end a draw before its law does
     every = np.inf if left.size <= risk * n else prognosis.horizon
     while np.isfinite(every) and np.sum(np.ceil(half / every) * every >= left) > risk * n:

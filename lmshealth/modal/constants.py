@@ -15,7 +15,7 @@ WORST_STD_LN_F, WORST_STD_LN_ZETA = 0.03, 0.7
 # Most channels of free decays that are fitted together, those that add most to each other: the time
 # of a fit grows with the cube of their number, and 10 hold all but 2 % of the information of 16.
 MOST_CHANNELS = 10
-# Most modes that are fitted together.
+# Most modes of free decays that are fitted together.
 MOST_TOGETHER = 4
 
 # Naming

@@ -490,6 +490,7 @@ def _spans(
     """Return the bands in Hz that are searched, ascending: where hints may be, or the whole."""
     usable = constants.USABLE * log.sample_rate
     if hints:
+        # Wider than the searches, above all downwards: what resonates beside a mode is fitted, too.
         ends = [(*hint.band(BAND_HALF_WIDTH), hint.search) for hint in hints]
         spans: list[tuple[float, float]] = []
         for low, high in sorted((a * (1 - search), b * (1 + search)) for a, b, search in ends):
@@ -643,7 +644,9 @@ def _fit_group(
         if scatter > constants.LOOSE_FIT and any(h.low <= f <= h.high for h in found.harmonics):
             detail = f"{f:.5g} Hz is not as steady as noise, and in the band of a line that wanders"
             rejected.setdefault(name, Rejection("line-not-mode", detail, float(f)))
-    return [replace(fit, rejected=rejected).keep(kept)]
+    # A pole that became a line is rejected, and no mode of the fit.
+    lines = fit.rejected.keys() - set(modes.names)
+    return [replace(fit, rejected=rejected).keep({*kept, *lines})]
 
 
 def _nothing_found(log: Log, lines: tuple[Line, ...], rejected: list[Refusal]) -> Refusal:

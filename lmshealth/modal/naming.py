@@ -7,6 +7,7 @@ or name competes for (`name_response`): tracking assigns the rest.
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -17,7 +18,7 @@ from lmshealth.io.log import Refusal
 from lmshealth.modal import constants
 from lmshealth.modal.modes import Modes, Rejection
 from lmshealth.modal.targets import Target
-from lmshealth.stage.description import Stage
+from lmshealth.stage.description import Stage, search_offset
 
 # Steps of the common shift of ln f over which assignments are summed.
 _COMMON_SHIFTS = 121
@@ -82,10 +83,10 @@ def pairing_probability(
     n, m = len(frequency), len(targets)
     if not n or not m:
         return np.zeros((n, m))
-    ln_f = np.log(np.asarray(frequency, dtype=float))
-    search = np.array([target.search for target in targets])
-    shift = ln_f[:, None] - np.log([target.frequency for target in targets])
-    admissible = np.abs(shift) <= np.log1p(search)
+    found = np.asarray(frequency, dtype=float)[:, None]
+    described, search = np.array([(target.frequency, target.search) for target in targets]).T
+    shift = np.log(found) - np.log(described)
+    admissible = np.abs(search_offset(found, described, search)) <= 1
     gain = np.full((n, m), constants.NAME_GAIN)
     if damping is not None:
         ratio = np.array(damping)[:, None] / [target.damping_ratio for target in targets]
@@ -143,7 +144,7 @@ def _odds(frequency: float, probability: FloatArray, targets: Sequence[Target]) 
 
 def is_near(target: Target, frequency: float, *, slack: float = 1.0) -> bool:
     """Return whether a frequency in Hz is within so many times the search of a target."""
-    return bool(abs(np.log(frequency / target.frequency)) <= slack * np.log1p(target.search))
+    return bool(abs(search_offset(frequency, target.frequency, target.search)) <= slack)
 
 
 def is_near_light(targets: Sequence[Target], frequency: float) -> bool:
@@ -233,9 +234,9 @@ class Named:
         """Yield the flags of a mode that follow from its description, none without a name."""
         if target is None:
             return
-        shift = abs(np.log(f / target.frequency)) / np.log1p(target.search)
+        offset = abs(search_offset(f, target.frequency, target.search))
         ratio = abs(np.log(zeta / target.damping_ratio)) / np.log(constants.DAMPING_SPAN)
-        if shift > constants.AT_BOUND or ratio > constants.AT_BOUND:
+        if offset > constants.AT_BOUND or ratio > constants.AT_BOUND:
             yield "at-bound"
         if target.name in self.doubtful:
             yield "doubtful-name"
@@ -250,8 +251,10 @@ class Named:
             return Refusal(self.log, reason, detail, mode=target.name, frequency=place)
         near = [
             (abs(np.log(row.frequency / target.frequency)), row)
-            for row in rejected.values()
-            if row.frequency is not None and is_near(target, row.frequency)
+            for name, row in rejected.items()
+            if name not in self.names
+            and row.frequency is not None
+            and is_near(target, row.frequency)
         ]
         if near:
             return replace(min(near, key=lambda one: one[0])[1], mode=target.name)
@@ -283,22 +286,28 @@ class Named:
 def name_resonances(both: Modes, targets: tuple[Target, ...], log: str) -> Named:
     """Name all resonances of a log, of which some may be no described mode.
 
-    Fewer than there are described modes are all taken for such modes. A lonely one of these is not
-    named by guessing: only two resonances show that the machine stands at its description.
+    Fewer than there are described modes are all taken for such modes where that is possible. A
+    lonely one of these is not named by guessing: only two resonances show that the machine stands
+    at its description.
     """
     near = [i for i, f in enumerate(both.frequency.tolist()) if any(is_near(t, f) for t in targets)]
     both = both.select(near)
-    fewer, more = len(near) < len(targets), len(near) > len(targets)
+    complete, more = len(near) < len(targets), len(near) > len(targets)
     frequency = both.frequency.tolist()
-    probability = pairing_probability(
+    pair = partial(
+        pairing_probability,
         frequency,
         targets,
         damping=both.damping_ratio.tolist(),
         shapes=likeness(both, targets),
-        complete=fewer,
-        standing=not fewer or len(near) > 1,
+        standing=not complete or len(near) > 1,
     )
-    names, ambiguous = assign(frequency, targets, probability, complete=fewer)
+    probability = pair(complete=complete)
+    if complete and not probability.any():
+        # They cannot all be described modes, as two that lie in one search only.
+        complete, more = False, True
+        probability = pair(complete=False)
+    names, ambiguous = assign(frequency, targets, probability, complete=complete)
     sure = clear_names(probability, targets, constants.SURE_NAME)
     likely = probability.sum(axis=1) > 0.5
     return Named(
@@ -392,5 +401,5 @@ def why_unnamed(modes: Modes, stage: Stage) -> Iterator[str]:
 
 def _within_search(modes: Modes, stage: Stage) -> BoolArray:
     """Return which modes lie in the search of which described mode, ``(n_described, n_modes)``."""
-    off = [np.abs(modes.frequency / spec.frequency_hz - 1) <= spec.search for spec in stage.modes]
-    return np.array(off, dtype=bool).reshape(len(stage.modes), -1)
+    offset = [search_offset(modes.frequency, m.frequency_hz, m.search) for m in stage.modes]
+    return np.abs(np.reshape(offset, (len(stage.modes), len(modes.names)))) <= 1

@@ -95,8 +95,11 @@ def summarise(
     edges = empty.edges
     weight = np.array([s.observed for s in spectra.spectra])
     parts = [_binned(s, edges, whole=n_singular > 0) for s in spectra.spectra]
-    matrix = np.average(parts, axis=0, weights=weight)
-    count = weight.sum() * np.diff(edges)
+    # Short segments may have no ordinates at low frequencies.
+    known = weight @ [_covered(s, edges) for s in spectra.spectra]
+    total: ComplexArray = np.tensordot(weight, parts, 1)
+    matrix = total / np.where(known > 0, known, 1.0)[:, None, None]
+    count = known * np.diff(edges)
     level = _decibel(np.diagonal(matrix, axis1=1, axis2=2).real.T)
     expected = np.full_like(level, np.nan)
     for fit in fitted:
@@ -115,7 +118,8 @@ def summarise(
 def _binned(spectrum: CrossSpectrum, edges: FloatArray, *, whole: bool) -> ComplexArray:
     """Average the matrices, or their diagonals, within bins: ``(n_bins, n_channels, n_channels)``.
 
-    Row by row: the matrices of many channels at all ordinates would not fit into memory.
+    They are zero where the spectrum has no ordinates. Row by row: the matrices of many channels at
+    all ordinates would not fit into memory.
     """
     n = spectrum.transforms.shape[2]
     cut = spectrum.band(edges[0] - 1 / spectrum.duration, edges[-1] + 2 / spectrum.duration)
@@ -128,12 +132,20 @@ def _binned(spectrum: CrossSpectrum, edges: FloatArray, *, whole: bool) -> Compl
         for j, part in zip(columns, row.mean(axis=0).T, strict=True):
             for own, unit in ((part.real, 1.0), (part.imag, 1j)):
                 binned[:, i, j] += unit * bin_density(cut, own, edges)
+    covered = _covered(spectrum, edges)
     for channel, frequency, amplitude in cut.lines:
         k = int(np.searchsorted(edges, frequency)) - 1
         if 0 <= k < len(binned):
-            power = amplitude**2 / 2 / spectrum.count
+            power = covered[k] * amplitude**2 / 2 / spectrum.count
             binned[k, channel, channel] += power / (edges[k + 1] - edges[k])
     return binned
+
+
+def _covered(spectrum: CrossSpectrum, edges: FloatArray) -> FloatArray:
+    """Return the share of each bin that the ordinates of a spectrum cover, shape ``(n_bins,)``."""
+    half = 0.5 / spectrum.duration
+    within = edges.clip(spectrum.frequency[0] - half, spectrum.frequency[-1] + half)
+    return np.asarray(np.diff(within) / np.diff(edges))
 
 
 def _expected(fit: FittedSpectrum, edges: FloatArray) -> FloatArray:
@@ -218,8 +230,7 @@ class Waterfall:
 def shown_band(stage: Stage) -> tuple[float, float]:
     """Return the band in Hz in which the tracked modes of a stage are searched."""
     modes = [mode for mode in stage.modes if mode.tracked] or stage.modes
-    low = min(mode.frequency_hz * (1 - mode.search) for mode in modes)
-    return low, max(mode.frequency_hz * (1 + mode.search) for mode in modes)
+    return min(mode.searched[0] for mode in modes), max(mode.searched[1] for mode in modes)
 
 
 def _relative_level(summary: SpectraSummary | None, edges: FloatArray) -> FloatArray:

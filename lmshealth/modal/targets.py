@@ -20,7 +20,7 @@ class Target:
     name: str
     frequency: float  # start value in Hz
     damping_ratio: float  # start value
-    search: float  # half width of the search, as a fraction of the frequency
+    search: float  # searched up to the factor 1 + search lower and higher
     narrow: bool = False  # whether it may be as narrow as a line, as one is described there
     # Described acceleration of channels by name, in any unit; empty where it is not described.
     shape: Mapping[str, float] = field(default_factory=dict, compare=False)

@@ -39,8 +39,7 @@ class ModeCheck:
     @property
     def searched(self) -> tuple[float, float]:
         """Band in Hz in which the mode is searched."""
-        f, share = self.mode.frequency_hz, self.mode.search
-        return f * (1 - share), f * (1 + share)
+        return self.mode.searched
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -69,6 +69,22 @@ class ModeSpec(_Part, frozen=True):
     def __hash__(self) -> int:
         return hash((self.name, self.frequency_hz))
 
+    @property
+    def searched(self) -> tuple[float, float]:
+        """Band in Hz in which the mode is searched."""
+        return self.frequency_hz / (1 + self.search), self.frequency_hz * (1 + self.search)
+
+
+def search_offset(
+    frequency: FloatArray | float, described: FloatArray | float, search: FloatArray | float
+) -> FloatArray:
+    """Return the shift of ln f from the described frequency as a share of the search.
+
+    From -1 to 1 a resonance lies in the search: at most by the factor 1 + search lower or higher.
+    Frequencies are in Hz; arguments are broadcast.
+    """
+    return np.asarray(np.log(frequency / described) / np.log1p(search))
+
 
 def _expect_length(name: str, components: Iterable[float]) -> None:
     if max(map(abs, components)) < constants.LEAST_COMPONENT:
@@ -533,7 +549,7 @@ def _check_map(path: Path, description: Description, modal_map: ModalMap) -> Non
     for mode in absent:
         for near in get_close_matches(mode.name.casefold(), free):
             name, f = free[near]
-            if abs(f / mode.frequency_hz - 1) <= mode.search:
+            if abs(search_offset(f, mode.frequency_hz, mode.search)) <= 1:
                 raise BadStage(
                     f"{path}: mode[{described.index(mode.name)}].name: {mode.name!r} is not on "
                     f"the map, whose {name!r} at {f:.4g} Hz no [[mode]] describes; write {name!r}, "

@@ -30,7 +30,8 @@ def regressors(
 ) -> tuple[Regressor, ...]:
     """Return the regressors of the described covariates that at least one log has.
 
-    Without a stage every covariate present is one, about its median. Keys are column names, values
+    Without a stage every covariate present is one, about its median in all logs: with further logs
+    the reference moves, and with it what ln f at the reference is. Keys are column names, values
     have shape ``(n_logs,)``.
     """
     if stage is not None:

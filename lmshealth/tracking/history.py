@@ -14,7 +14,8 @@ from lmshealth._private.tables import fact
 from lmshealth.errors import NotEnoughData
 from lmshealth.io.log import Notice, Refusal
 from lmshealth.modal.log_estimates import LogEstimates
-from lmshealth.stage.description import ModeSpec, Stage
+from lmshealth.modal.modes import Modes
+from lmshealth.stage.description import ModeSpec, Stage, search_offset
 from lmshealth.tracking import constants
 from lmshealth.tracking.association.associate import Association, Estimates, associate
 from lmshealth.tracking.contradictions import BY_CLOCK, NO_MOMENT, are_many, without_contradictions
@@ -195,6 +196,7 @@ class History(Result):
             loop_error=self.loop_error[:n],
             baselines=tuple(first for first in self.baselines if first < n),
             steps=tuple(steps),
+            in_doubt=self.in_doubt if n > self.baseline else (),
         )
 
     def backwards(self, first: int, last: int) -> Self:
@@ -306,6 +308,7 @@ def build_history(
         if label.reason != "jump"
     ]
     modes, series, columns = _line_up(estimates, found, stage)
+    refused += _undescribed(ordered, estimates, found, modes)
     history = History(
         stage=str(ordered[0].metadata.stage),
         logs=tuple(reading.log for reading in ordered),
@@ -356,7 +359,6 @@ def _steps(ordered: Sequence[LogEstimates], actions: Sequence[Action]) -> tuple[
     for name in known[1:]:
         there = np.array(ids[1:]) == name
         steps.append(Step("servo", int(np.argmax(there)), there, name=name))
-    retuned = {step.first for step in steps}
     for action in sorted(actions, key=lambda action: action.recorded_at):
         later = np.array([m is not None and m >= action.recorded_at for m in moments])
         first = int(np.argmax(later))
@@ -364,8 +366,8 @@ def _steps(ordered: Sequence[LogEstimates], actions: Sequence[Action]) -> tuple[
         if not later.any() or first == 0:
             continue
         kind: StepKind = "reset" if action.action in RESETS else _KINDS[action.action]
-        # A retuning that comes with a new servo_id is one step, not two.
-        if kind == "servo" and first in retuned:
+        # A retuning that comes with a new servo_id is one step, and so is work on guide and mount.
+        if any((step.kind, step.first) == (kind, first) for step in steps):
             continue
         name = action.recorded_at.date().isoformat()
         steps.append(Step(kind, first, np.arange(len(ordered)) >= first, name=name))
@@ -387,17 +389,15 @@ def _baselines(ordered: Sequence[LogEstimates], steps: Sequence[Step]) -> tuple[
 def _estimates(ordered: Sequence[LogEstimates], stage: Stage | None) -> list[Estimates]:
     """Return the estimates of tracked modes of each log, with shapes over all channels."""
     tracked = [] if stage is None else [mode for mode in stage.modes if mode.tracked]
-    known = {mode.name for mode in tracked}
     channels = list(dict.fromkeys(c for r in ordered for c in r.modes.shape_channels))
     estimates = []
     for modes in (reading.modes for reading in ordered):
-        pairs = zip(modes.names, modes.frequency.tolist(), strict=True)
-        names = [name or _nearest(frequency, tracked) for name, frequency in pairs]
-        shapes = np.full((len(names), len(channels)), np.nan)
+        names = dict(enumerate(modes.names)) if stage is None else _tracked(modes, tracked)
+        n, kept = len(modes.names), sorted(names)
+        shapes = np.full((n, len(channels)), np.nan)
         shapes[:, [channels.index(channel) for channel in modes.shape_channels]] = modes.shapes
-        kept = [i for i, name in enumerate(names) if stage is None or name in known]
         at = np.array(kept, dtype=int)
-        both = np.concatenate([at, at + len(names)])
+        both = np.concatenate([at, at + n])
         estimates.append(
             Estimates(
                 names=tuple(names[i] for i in kept),
@@ -411,11 +411,53 @@ def _estimates(ordered: Sequence[LogEstimates], stage: Stage | None) -> list[Est
     return estimates
 
 
-def _nearest(frequency: float, modes: Sequence[ModeSpec]) -> str:
-    """Return the nearest mode whose search holds a frequency in Hz, else no name."""
-    off = [(abs(frequency / mode.frequency_hz - 1), mode) for mode in modes]
-    near = [(away, mode.name) for away, mode in off if away <= mode.search]
-    return min(near, key=lambda one: one[0], default=(0.0, ""))[1]
+def _tracked(modes: Modes, tracked: Sequence[ModeSpec]) -> dict[int, str]:
+    """Return the indices of the estimates that may be of tracked modes, with their names.
+
+    One without a name gets that of the nearest mode, if its search holds it and no other estimate
+    of the log by the same source has that name.
+    """
+    known = {mode.name for mode in tracked}
+    found = {i: name for i, name in enumerate(modes.names) if name in known}
+    near = []
+    for i, frequency in enumerate(modes.frequency.tolist()):
+        off = [
+            (float(abs(search_offset(frequency, mode.frequency_hz, mode.search))), i, mode.name)
+            for mode in tracked
+        ]
+        held = [one for one in off if one[0] <= 1]
+        near += [min(held)] if held and not modes.names[i] else []
+    taken = {(modes.sources[i], name) for i, name in found.items()}
+    for _, i, name in sorted(near):
+        own = modes.sources[i], name
+        found[i] = "" if own in taken else name
+        taken.add(own)
+    return found
+
+
+def _undescribed(
+    ordered: Sequence[LogEstimates],
+    estimates: Sequence[Estimates],
+    found: Association,
+    modes: Sequence[str],
+) -> list[Refusal]:
+    """Refuse the estimates of modes that are not described."""
+    refused = []
+    for reading, own, labels in zip(ordered, estimates, found.labels, strict=True):
+        for ln_f, source, label in zip(own.ln_frequency, own.sources, labels, strict=True):
+            if label.mode is not None and label.mode not in modes:
+                f = float(np.exp(ln_f))
+                detail = (
+                    f"a resonance at {f:.5g} Hz is none of the described modes, and lies in the "
+                    "search of one: describe it, or correct the description"
+                )
+                refused.append(
+                    Refusal(
+                        reading.log, "undescribed", detail, mode=f"{f:.5g} Hz", source=source,
+                        frequency=f,
+                    )
+                )  # fmt: skip
+    return refused
 
 
 def _line_up(

@@ -5,7 +5,7 @@ Declared steps are in the model from the start; a detected step is added, and th
 are filtered again from the checkpoint before it. No epoch uses later logs; `smooth` does.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from datetime import datetime
 from functools import reduce
@@ -215,7 +215,8 @@ def track(history: History, stage: Stage | None = None) -> Track:
     Returns
     -------
     Track
-        Filtered: no epoch uses later logs.
+        Filtered: no epoch uses later logs, but for the medians to which ln f refers without a
+        stage.
 
     Raises
     ------
@@ -452,12 +453,31 @@ def accepted_estimates(history: History, track: Track, *, doubtful: bool = False
     return replace(changed, in_doubt=tuple(in_doubt))
 
 
-def outlier_refusals(history: History, track: Track) -> list[Refusal]:
-    """List the outliers of a track as refusals."""
+def known_shifts(
+    history: History, track: Track, stage: Stage | None, logs: Iterable[int]
+) -> FloatArray:
+    """Return what covariates, steps of the loop, sensors and biases add to ln f of some logs.
+
+    By the effects after the last epoch; shape ``(n, n_series)`` for n logs.
+    """
+    space = StateSpace(history, stage, track.steps)
+    places = [at for _, _, at in space.effects]
+    effects = np.array([one.coefficient for one in track.effects[: len(places)]])
+    n_series = len(history.series)
+    found = [space.matrix(k)[:n_series, places] @ effects for k in logs]
+    return np.array(found).reshape(-1, n_series)
+
+
+def outlier_refusals(history: History, track: Track, stage: Stage | None = None) -> list[Refusal]:
+    """List the outliers of a track as refusals; the stage is that of `track`."""
+    if not track.outliers:
+        return []
     refused = []
-    for k, mode in track.outliers:
+    shifts = known_shifts(history, track, stage, [k for k, _ in track.outliers])
+    for (k, mode), shift in zip(track.outliers, shifts, strict=True):
         i, own = track.modes.index(mode), history.columns(mode)
-        found = float(np.exp(np.nanmean(history.ln_frequency[k, own])))
+        # As it would be without what the track explains.
+        found = float(np.exp(np.nanmean((history.ln_frequency[k] - shift)[own])))
         before = float(np.exp(track.ln_frequency[k - 1, i]))
         detail = (
             f"{found:.5g} Hz, or its damping, is far from the estimates of all logs before "
@@ -552,16 +572,13 @@ def find_covariate_effects(
     The order is that of the description; a covariate that is unknown or never left its reference
     has no effect. In a long history the level is the filtered one.
     """
-    space = StateSpace(history, stage, track.steps)
-    columns, places = space.regressed, [at for _, _, at in space.effects]
+    columns = regressors(history.covariates, stage, history.recorded_at)
     if not columns:
         return ()
     taken = accepted_estimates(history, track)
     short = len(taken.logs) <= constants.MOST_SMOOTHED
     level = (smooth(taken, track, stage) if short else track).ln_frequency
-    coefficients = np.array([one.coefficient for one in track.effects[: len(places)]])
-    logs, n_series = range(len(history.logs)), len(history.series)
-    moved = np.array([space.matrix(k)[:n_series, places] @ coefficients for k in logs])
+    moved = known_shifts(history, track, stage, range(len(history.logs)))
     rest = taken.ln_frequency - level[:, taken.mode_of()] - moved
     found = []
     for covariate in stage.description.covariate:

@@ -235,6 +235,7 @@ def test_rows_are_of_the_limits_that_no_work_has_restored(
             parameters=("guide_preload", "mount_stiffness", "any"),
             limits=np.array([0.6, 0.7, np.nan]),
             remaining=both,
+            half=both[:, :-1] / 2,
             health=np.full((1000, 2), 0.8),
             curve_quantiles=np.full((5, 3, 2), 0.8),
         )

@@ -488,6 +488,7 @@ def test_any_limit_is_not_printed_twice(printed: Printed, other: float) -> None:
         parameters=("guide_preload", "mount_stiffness", "any"),
         limits=np.array([0.6, 0.7, np.nan]),
         remaining=both,
+        half=remaining / 2,
         health=np.full((1001, 2), 0.8),
         curve_quantiles=np.full((5, 3, 2), 0.8),
     )

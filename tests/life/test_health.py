@@ -491,6 +491,23 @@ def test_a_machine_without_an_odometer_has_a_life_by_days(tmp_path: Path, histor
     assert np.isfinite(prognosis.remaining).any()
 
 
+@pytest.mark.usefixtures("unchained")
+def test_drifts_of_a_machine_without_an_odometer_have_a_life_by_days(tmp_path: Path) -> None:
+    """Two drifts a week apart: the second is that of an odometer with so many km a week."""
+    usage = "[usage]\nkm_per_day = 100\n"
+    by_days = make_stage(tmp_path / "days", (FADING,), tail=usage + DAYS)
+    by_odometer = make_stage(tmp_path / "odometer", (FADING,), tail=usage + LAWS_ALONE)
+    drift = true_drift(("guide_preload",), np.log([0.8]))[:2]
+    made = make_track(np.array([drift / 2, drift]), np.array([COV, COV]))
+    bare = read(made)
+    timed = infer_drifts(replace(bare, travel=np.full(2, np.nan)), by_days, 5)
+    (days,) = [one.total_seconds() / 86400 for one in np.diff(np.array(bare.recorded_at))]
+    known = infer_drifts(replace(bare, travel=np.array([0.0, 1e5 * days])), by_odometer, 5)
+    assert timed.recorded_at == known.recorded_at == bare.recorded_at[1:]
+    np.testing.assert_allclose(timed.samples, known.samples, rtol=1e-5)
+    np.testing.assert_allclose(timed.travel, known.travel)
+
+
 def test_a_clock_of_days_needs_the_travel_of_a_day(tmp_path: Path) -> None:
     """Without km_per_day the description is refused, with the key to state."""
     path = tmp_path / "small.toml"

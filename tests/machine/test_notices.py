@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
+from datetime import timedelta
 from pathlib import Path
 from typing import Any
 
@@ -21,8 +23,9 @@ from lmshealth.report.language import in_language, sentence
 from lmshealth.report.text import changes, headline, service_on_day
 from lmshealth.stage.description import load_stage
 from lmshealth.tracking.history import Step
+from lmshealth.tracking.maintenance import Action, Maintenance
 from tests.assessments import Assessment, Maker, make, nothing, tables_of
-from tests.lives import FREQUENCY, MODES, make_reading, make_stage
+from tests.lives import FREQUENCY, MODES, START, make_reading, make_stage
 
 __all__ = ["make"]
 
@@ -152,6 +155,28 @@ def test_a_drift_that_no_scatter_explains_is_stated_at_once(tmp_path: Path, n: i
     assert (status.device_health, [*status.conditions]) == ("OFF_SPEC", ["large-drift"])
     # With enough logs the filter has learned how they scatter: alarms decide.
     assert assess(few_logs(5, 0.014, 1), stage).drifted == {}
+
+
+def test_a_drift_at_another_temperature_is_that_of_the_machine(tmp_path: Path) -> None:
+    """What a covariate adds is no drift: the last of four warm logs has moved by +1.4 %."""
+    stage = make_stage(tmp_path, parameters=())
+    rng, slope, logs = np.random.default_rng(2), -1e-3, []
+    warmth = np.r_[rng.uniform(-20, 20, 20), 20.0, 20.0, 20.0, 20.0]
+    for day, offset in enumerate(warmth.tolist()):
+        values = np.log(FREQUENCY) + slope * offset + 1e-4 * rng.standard_normal(len(MODES))
+        values[1] += 0.014 * (day == 23)
+        own = make_reading(
+            f"{day}", float(day), 1e5 * day, dict(zip(MODES, values, strict=True)),
+            covariates={"temperature_c": 21.0 + offset},
+        )  # fmt: skip
+        cov = np.diag([2.5e-7] * len(MODES) + [1e-3] * len(MODES))
+        logs.append(replace(own, modes=replace(own.modes, cov=cov)))
+    work = Maintenance((Action("AX-1", START + timedelta(days=19.5), "guide-replaced"),))
+    found = assess(logs, stage, work=work)
+    assert found.drifted["pitch"][0] == pytest.approx(0.014, abs=2e-3)
+    (refused,) = (one for one in found.refused if one.reason == "jump")
+    frequency, before = map(float, re.findall(r"[\d.]+(?= Hz)", refused.detail))
+    assert frequency / before == pytest.approx(1.014, abs=2e-3)
 
 
 def test_after_a_reset_of_the_odometer_no_health_is_stated(tmp_path: Path) -> None:

@@ -19,6 +19,7 @@ from lmshealth.machine.service import (
     decide,
     probability_before,
     remaining_days,
+    without_limits,
 )
 from lmshealth.stage.description import Decision
 from tests.lives import START, make_prognosis
@@ -247,6 +248,7 @@ def test_the_probability_before_a_day_is_the_share_of_draws() -> None:
         parameters=("guide_preload", "mount_stiffness", "any"),
         limits=np.array([0.6, 0.7, np.nan]),
         remaining=np.column_stack([one, other, np.minimum(one, other)]),
+        half=np.column_stack([one, other]) / 2,
         health=np.ones((10, 2)),
         curve_quantiles=np.ones((5, 3, 2)),
     )
@@ -283,12 +285,12 @@ def test_without_a_prognosis_the_service_is_unknown() -> None:
 def missed(prognosis: Prognosis, every: float) -> float:
     """Return the share of draws that end without a log after half of the loss, log by log."""
     found = 0
-    for half, left in zip(prognosis.half, prognosis.remaining[:, -1], strict=True):
+    for half, left in zip(prognosis.half[:, 0], prognosis.remaining[:, -1], strict=True):
         log = every
         while log < half:
             log += every
         found += log >= left
-    return found / prognosis.half.size
+    return found / len(prognosis.half)
 
 
 def test_logs_at_the_advised_interval_announce_the_end(rng: np.random.Generator) -> None:
@@ -301,10 +303,30 @@ def test_logs_at_the_advised_interval_announce_the_end(rng: np.random.Generator)
     assert missed(prognosis, service.inspect_every) <= 0.01
     assert missed(prognosis, service.inspect_every / 0.9) > 0.01
     # Faster losses ask for more frequent logs; without an end no log is asked for.
-    late = replace(prognosis, half=0.95 * prognosis.remaining[:, -1])
-    steep = replace(prognosis, half=0.5 * prognosis.remaining[:, -1])
+    late = replace(prognosis, half=0.95 * prognosis.remaining[:, :-1])
+    steep = replace(prognosis, half=0.5 * prognosis.remaining[:, :-1])
     assert decide(steep, Decision()).inspect_every == service.inspect_every
     assert 0 < decide(late, Decision()).inspect_every < 0.5 * service.inspect_every
     endless = decide(aged(np.full(100, np.inf), 2e5), Decision())
     assert (endless.inspect_by, endless.inspect_every) == (None, np.inf)
     assert endless.earliest_end is None
+
+
+def test_after_work_logs_are_as_frequent_as_the_limits_left_ask_for() -> None:
+    """The half of the loss is that of the limit reached first of those that are not restored."""
+    late = make_prognosis(np.linspace(4e6, 6e6, 100), np.full(100, 1e4))
+    late = replace(late, half=0.95 * late.remaining[:, :-1])
+    soon = late.remaining[:, :-1] / 50
+    both = replace(
+        late,
+        parameters=("mount_stiffness", *late.parameters),
+        limits=np.array([0.6, *late.limits]),
+        remaining=np.column_stack([soon, late.remaining[:, :-1], soon]),
+        half=np.column_stack([soon / 2, late.half]),
+        health=np.tile(late.health, 2),
+        curve_quantiles=np.tile(late.curve_quantiles, 2),
+    )
+    left = without_limits(both, ["mount_stiffness"])
+    assert left is not None and left.parameters == late.parameters
+    every = [decide(one, Decision()).inspect_every for one in (both, left, late)]
+    assert every[1] == every[2] != every[0]

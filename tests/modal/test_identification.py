@@ -27,7 +27,7 @@ from lmshealth.modal.ambient.cluster_fit import fit_modes
 from lmshealth.modal.ambient.cluster_modes import ClusterFit
 from lmshealth.modal.ambient.search import Found, search, split_groups
 from lmshealth.modal.identification import identify, read_ambient, read_modes
-from lmshealth.modal.modes import Modes
+from lmshealth.modal.modes import Modes, Rejection
 from lmshealth.modal.targets import Target
 from lmshealth.signal import segments, spectra
 from lmshealth.signal.spectra import LogSpectra
@@ -1125,6 +1125,27 @@ def test_stops_that_excite_nothing_leave_the_log_too_short() -> None:
     refused = r"too-short.*no segment of constant velocity.*decays after stops: no resonance"
     with pytest.raises(BadLog, match=refused):
         identify(log, make_stage([("a", 62.0, 0.02)]))
+
+
+def test_a_mode_that_became_a_line_beside_others_is_refused_as_one(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """The mode of a group whose pole collapsed keeps its rejection though the others survive."""
+
+    def collapsing(*given: Any, **options: Any) -> ClusterFit:
+        fit = fit_modes(*given, **options)
+        assert fit.modes is not None
+        (line,) = [t.name for t in given[1] if abs(t.frequency - 136.6) < 2]
+        rejection = Rejection("line-not-mode", "136.6 Hz", 136.6)
+        kept = [name for name in fit.modes.names if name != line]
+        return replace(fit, modes=fit.modes.keep(kept), rejected={line: rejection})
+
+    monkeypatch.setattr(modal, "fit_modes", collapsing)
+    log = acceleration_log(rng(5), lms_y_modes(), 60, RATE, 0.5)
+    reading = read_ambient(log, make_stage(LMS_Y))
+    assert reading.modes.names == ("roll", "yaw")
+    assert why(reading.modes, "pitch") == "line-not-mode"
+    assert [row.reason for row in reading.rejected] == ["line-not-mode"]
 
 
 def test_a_line_at_a_mode_that_is_no_harmonic_costs_no_second_fit(

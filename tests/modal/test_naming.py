@@ -9,12 +9,16 @@ from typing import Any
 import numpy as np
 import pytest
 
+from lmshealth.io.log import Refusal
 from lmshealth.modal.constants import SURE_NAME
-from lmshealth.modal.modes import Modes, Rejection, estimates_only
+from lmshealth.modal.modes import Modes, Rejection, estimates_only, merge
 from lmshealth.modal.naming import (
+    Named,
     assign,
     compare,
+    is_near,
     likeness,
+    name_resonances,
     name_response,
     pairing_probability,
     why_unnamed,
@@ -121,6 +125,69 @@ def test_unshifted_beside_an_undescribed_mode_beats_a_shift_to_the_neighbours() 
     row = [117.0, 126.0, 137.0, 148.0]
     probability = pairing_probability(row, regular, damping=[0.015] * 4, standing=True)
     assert probability.max() < SURE_NAME
+
+
+def found(frequency: Sequence[float], damping: Sequence[float]) -> Modes:
+    """Make modes with provisional names."""
+    n = len(frequency)
+    cov = np.eye(2 * n) * 1e-6
+    modes = estimates_only(np.log([*frequency, *damping]), cov, np.ones(n), "acc", ["a"] * n)
+    return replace(modes, names=tuple(f"mode_{i}" for i in range(n)))
+
+
+def test_a_resonance_that_is_no_described_mode_costs_the_others_no_name() -> None:
+    """Of few resonances two share the only mode near them, or one has another damping."""
+    targets = tuple(Target(n, 100.0 * (1 + i), 0.015, 0.05) for i, n in enumerate("abcd"))
+    shared = name_resonances(found([99.0, 101.0, 200.0], [0.015] * 3), targets, "log")
+    assert shared.names == {"mode_2": "b"}
+    assert set(shared.ambiguous) == {"a"}
+    narrow = name_resonances(found([100.0, 200.0, 301.0], [0.015, 0.015, 0.0014]), targets, "log")
+    assert narrow.names == {"mode_0": "a", "mode_1": "b"}
+    assert narrow.undescribed == {"mode_2"}
+    # Control: where all can be described modes, all are.
+    whole = name_resonances(found([100.0, 200.0, 301.0], [0.015] * 3), targets, "log")
+    assert whole.names == {"mode_0": "a", "mode_1": "b", "mode_2": "c"}
+
+
+def test_beside_a_resonance_that_is_no_described_mode_a_name_may_be_doubtful() -> None:
+    """The second of two near one mode is undescribed: an assignment that is not sure has a flag."""
+    targets = tuple(
+        Target(n, f, 0.015, 0.15) for n, f in (("a", 100.0), ("b", 200.0), ("c", 300.0))
+    )
+    two = name_resonances(found([92.0, 101.0], [0.015] * 2), targets, "log")
+    assert two.names == {"mode_1": "a"}
+    assert two.doubtful == {"a"}
+
+
+def test_a_silent_mode_is_not_refused_for_the_resonance_of_another() -> None:
+    """Roll is too uncertain, and pitch, in whose search it lies, is not excited."""
+    uncertain = Refusal("log", "too-uncertain", "112 Hz", mode="mode_0", frequency=112.0)
+    named_roll = Named({"mode_0": "roll"}, frozenset(), {}, frozenset(), "log")
+    modes = named_roll.publish(merge([], (), ()), TARGETS[:2], {"mode_0": uncertain})
+    assert {r.mode: r.reason for r in modes.refused} == {
+        "roll": "too-uncertain",
+        "pitch": "not-excited",
+    }
+    # Control: a resonance without a name may be either.
+    unnamed = replace(named_roll, names={}).publish(
+        merge([], (), ()), TARGETS[:2], {"mode_0": uncertain}
+    )
+    assert {r.reason for r in unnamed.refused} == {"too-uncertain"}
+
+
+@pytest.mark.parametrize(("frequency", "inside"), [(86, 0), (87, 1), (114.9, 1), (115.1, 0)])
+def test_a_search_reaches_by_the_same_factor_down_and_up(frequency: float, inside: bool) -> None:
+    """At 100 Hz one of 0.15 reaches from 87 to 115 Hz for every method."""
+    target = Target("roll", 100.0, 0.02, 0.15)
+    assert is_near(target, frequency) == inside
+    assert (pairing_probability([frequency], [target])[0, 0] > 0) == inside
+    one = found([frequency], [0.02])
+    stage = make_stage([("roll", 100.0, 0.02)])
+    assert name_response(one, stage).names == ("roll" if inside else "",)
+    named_all = name_resonances(one, (target, replace(target, name="yaw", frequency=200.0)), "log")
+    assert named_all.names == ({"mode_0": "roll"} if inside else {})
+    published = named_all.publish(one, (target,), {})
+    assert published.flags == (("at-bound",) if inside else ())
 
 
 def shaped(name: str, frequency: float, shape: list[float], damping: float = 0.015) -> Modes:

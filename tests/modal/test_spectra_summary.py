@@ -7,6 +7,7 @@ import pytest
 
 from lmshealth.io.log import Log
 from lmshealth.modal.identification import read_ambient
+from lmshealth.modal.modes import merge
 from lmshealth.modal.spectra_summary import (
     WATERFALL_BINS,
     SpectraSummary,
@@ -15,7 +16,7 @@ from lmshealth.modal.spectra_summary import (
     shown_band,
     summarise,
 )
-from lmshealth.signal.spectra import CrossSpectrum
+from lmshealth.signal.spectra import CrossSpectrum, LogSpectra
 from lmshealth.signal.spectral_lines import Line
 from tests.signals import Mode, accelerations, density, make_log, make_stage, sine, white
 
@@ -62,6 +63,28 @@ def test_a_channel_without_power_has_no_level() -> None:
     assert np.isnan(summary.fitted).all()
 
 
+@pytest.mark.parametrize("least", [0.0, 0.6])
+def test_segments_without_low_frequencies_do_not_lower_the_level_there(least: float) -> None:
+    """White noise and a line in a long and a cut short segment keep level and power."""
+
+    def flat(duration: float, least: float, count: int) -> CrossSpectrum:
+        frequency = np.arange(1, 5 * duration) / duration
+        ones = np.ones((count, frequency.size, 1), dtype=complex)
+        free, lines = np.ones(frequency.size, dtype=bool), ((0, 2.0, 0.3),) * count
+        return CrossSpectrum(frequency, ones, duration, np.nan, free, lines).band(least, np.inf)
+
+    spectra = LogSpectra(("acc_a",), ("acc",), (flat(120.0, 0.0, 1), flat(20.0, least, 20)))
+    summary = summarise(spectra, (), merge([], (), ()), (0.1, 4.0), 20)
+    density = 10 ** (summary.level[0].astype(float) / 10)
+    power, width = density @ np.diff(summary.edges), np.diff(summary.edges)
+    line = int(np.searchsorted(summary.edges, 2.0)) - 1
+    assert np.delete(density, line) == pytest.approx(1.0, abs=1e-3)
+    assert power - width.sum() == pytest.approx(0.3**2 / 2, abs=1e-3)
+    observed = np.where(summary.edges[1:] < least - 0.025, 120.0, 520.0)
+    whole = (summary.edges[1:] < least - 0.025) | (summary.edges[:-1] > least)
+    assert summary.count[whole] == pytest.approx((observed * width)[whole], rel=1e-3)
+
+
 # Waterfall
 
 WIDE, RATE_W, QUIET = 40_000, 1000.0, 1e-4
@@ -91,7 +114,7 @@ def resonant(factor: float = 1.0) -> Log:
 
 def test_band_is_where_tracked_modes_are_looked_for() -> None:
     """It reaches from the lowest search to the highest."""
-    assert shown_band(STAGE) == pytest.approx((85.0, 184.0))
+    assert shown_band(STAGE) == pytest.approx((100.0 / 1.15, 184.0))
 
 
 def test_binning_keeps_the_power() -> None:

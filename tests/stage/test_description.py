@@ -24,7 +24,7 @@ from lmshealth.io.log import Metadata
 from lmshealth.report.tables import stage_rows
 from lmshealth.stage.check import check_stage, diagnose
 from lmshealth.stage.degradation_laws import Free, Unchanging
-from lmshealth.stage.description import Stage, load_stage, shipped
+from lmshealth.stage.description import ModeSpec, Stage, load_stage, search_offset, shipped
 from lmshealth.stage.identifiability import plan
 from lmshealth.stage.modal_map import read_map
 from tests.lives import FADING, FOOT, MOUNT, PRELOAD, make_stage, map_rows, stage_text, true_drift
@@ -195,6 +195,15 @@ def test_a_map_without_any_tracked_mode_is_refused(tmp_path: Path) -> None:
     text = stage_text().replace('name = "roll"', 'name = "bounce"').replace('"pitch"', '"sway"')
     with pytest.raises(BadStage, match=r"none of them is a tracked.*bounce"):
         load(tmp_path, text)
+
+
+def test_a_search_has_one_definition() -> None:
+    """The band that is searched and the offset from the description have the same ends."""
+    mode = ModeSpec("roll", 120.0, 0.015, search=0.9)
+    low, high = mode.searched
+    assert (low, high) == pytest.approx((120.0 / 1.9, 228.0))
+    offset = search_offset(np.array([low, 120.0, high]), mode.frequency_hz, mode.search)
+    assert offset == pytest.approx([-1.0, 0.0, 1.0])
 
 
 @pytest.mark.parametrize("slip", ["pich", "Pitch"])

@@ -248,6 +248,26 @@ def test_work_is_a_step_or_a_baseline(stage: Stage) -> None:
     assert history.baseline == 4
 
 
+def test_work_of_one_day_is_one_step(stage: Stage) -> None:
+    """Work on guide and mount before one log lets the modes jump once, by as much as either."""
+    readings = [make_reading(str(k), k, 1e5 * k, {"roll": 4.8}) for k in range(4)]
+    told = [
+        Action("AX-1", START + timedelta(days=1.5), action)
+        for action in ("guide-replaced", "preload-adjust", "regrease", "regrease")
+    ]
+    history, _ = build_history(readings, stage, told)
+    assert [(step.kind, step.first) for step in history.steps] == [("reset", 2), ("regreasing", 2)]
+
+
+def test_a_first_log_in_doubt_is_that_of_its_baseline(stage: Stage) -> None:
+    """A life that has ended does not begin with the doubtful log of the next one."""
+    readings = [make_reading(str(k), k, 1e5 * k, {"roll": 4.8}) for k in range(6)]
+    history, _ = build_history(readings, stage)
+    doubtful = replace(history, baselines=(0, 4), in_doubt=(0,))
+    assert doubtful.first_logs(4).in_doubt == ()
+    assert doubtful.first_logs(5).in_doubt == (0,)
+
+
 def test_without_every_odometer_the_clock_is_time(stage: Stage) -> None:
     """One log without travel makes the time of recording the clock."""
     readings = [make_reading(str(k), k, 1e5 * k, {"roll": 4.8}) for k in range(3)]
@@ -264,6 +284,27 @@ def test_modes_without_a_name_are_given_one(stage: Stage) -> None:
     history, _ = build_history([reading, far], stage)
     assert history.modes == ("roll",)
     assert np.isnan(history.ln_frequency[1]).all()
+
+
+def test_a_name_is_given_once(stage: Stage) -> None:
+    """A resonance beside a named mode is not that mode: it is refused, and the mode stays."""
+    beside, pitch = np.log([132.2, 136.6])
+    readings = [
+        make_reading(str(k), k, 1e5 * k, {"": float(beside), "pitch": float(pitch)})
+        for k in range(6)
+    ]
+    alike = [replace(r, modes=replace(r.modes, cov=1e-6 * np.eye(4))) for r in readings]
+    history, refused = build_history(alike, stage)
+    assert history.series == (Series("pitch", "acc"),)
+    np.testing.assert_allclose(history.ln_frequency[:, 0], pitch)
+    # Until three logs show it, it is of no known mode.
+    reasons = [one.reason for one in refused]
+    assert reasons == ["unconfirmed"] * 2 + ["undescribed"] * 4
+    assert {one.mode for one in refused[2:]} == {"132.2 Hz"}
+    # Without a name both may be the mode: the nearer one is.
+    unnamed = [replace(r, modes=replace(r.modes, names=("", ""))) for r in alike]
+    history, _ = build_history(unnamed, stage)
+    np.testing.assert_allclose(history.ln_frequency[:, 0], pitch)
 
 
 def test_the_first_declared_baseline_counts(stage: Stage) -> None:

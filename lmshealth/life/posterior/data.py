@@ -126,12 +126,16 @@ class LifeData(ReadOnly):
 
 def with_clock(history: History, stage: Stage) -> History:
     """Return a history with the odometer that the clock of its description asks for."""
+    return replace(history, travel=clock_travel(history.travel, history.seconds, stage))
+
+
+def clock_travel(travel: FloatArray, seconds: FloatArray, stage: Stage) -> FloatArray:
+    """Return the odometer in m that the clock of a description asks for, shape of ``travel``."""
     if stage.description.life.clock == "odometer":
-        return history
+        return travel
     per_day = stage.description.usage.km_per_day
     assert per_day is not None  # the description has been checked
-    days = (history.seconds - history.seconds[:1]) / SECONDS_PER_DAY
-    return replace(history, travel=days * per_day * KM)
+    return np.asarray((seconds - seconds[:1]) / SECONDS_PER_DAY * per_day * KM)
 
 
 def _with_regressors(

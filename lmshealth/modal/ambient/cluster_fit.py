@@ -30,6 +30,7 @@ from lmshealth.modal.modes import Modes, Rejection, paired
 from lmshealth.modal.targets import Target
 from lmshealth.signal.constants import LINE_WIDTH
 from lmshealth.signal.spectra import CrossSpectrum, LogSpectra, median_ordinate
+from lmshealth.stage.description import search_offset
 
 # So many channels are fitted as they are; of more, directions that leave so much of each mode.
 _FEW, _SEEN = 4, 0.9
@@ -722,7 +723,8 @@ def _incredible(modes: Modes, i: int, target: Target, duration: float) -> Reject
             "noise: lines, unsteady operation or an impact; export a steadier part of the log",
         )
     started = target.frequency
-    if abs(np.log(f / started)) > np.log1p(target.search) or zeta > constants.MOST_DAMPING:
+    moved = abs(search_offset(f, started, target.search))
+    if moved > 1 or zeta > constants.MOST_DAMPING:
         return Rejection(
             "outside-search",
             f"the fit in {channel} converged to {f:.5g} Hz, damping {zeta:.2g}; it began at "

@@ -25,6 +25,9 @@ _LEAST_PRE = 2  # samples before a blow, and half a pulse
 # An overload: samples that equal the largest, and their share of those above 0.9 of it. A sine in
 # steps of 1 % of its amplitude spends 0.31 of these in its outermost step.
 _STUCK, _FLAT, _FINE = 3, 0.4, 0.01
+# A side that reaches less than this share of the largest value is no overload: a force at rest has
+# few levels there, and looks flat.
+_SIDE = 0.5
 
 
 class Hit(NamedTuple):
@@ -139,7 +142,7 @@ def _usable(
             reason, step = "weak-blow", "strike harder"
             found = f"{100 * main.peak / strongest:.2g} % of the strongest, needed "
             found += f"{100 * constants.WEAK_BLOW:.0f} %"
-        elif any(_overloaded(x[main.start : stop]) for x in (force, output, -force, -output)):
+        elif any(_overloaded(x[main.start : stop]) for x in (force, output)):
             reason, step = "overload", "raise the range"
             found = "force or output stays at its largest value"
         elif stop - main.start < min(length, force.size) / 2:
@@ -159,8 +162,14 @@ def _usable(
 
 
 def _overloaded(values: FloatArray) -> bool:
-    """Return whether the top of a signal is flat."""
+    """Return whether the top or the bottom of a signal is flat."""
     x = values - np.median(values)
+    least = _SIDE * float(np.abs(x).max())
+    return any(_is_flat(side) for side in (x, -x) if side.max() >= least)
+
+
+def _is_flat(x: FloatArray) -> bool:
+    """Return whether the top of a signal is flat."""
     top = float(x.max())
     near = np.unique(x[x >= 0.9 * top])
     if near.size > 1 and np.diff(near).min() > _FINE * top:

@@ -87,8 +87,8 @@ class ResponseFit(ReadOnly):
 def fit_response(ordinates: Ordinates) -> ResponseFit:
     """Fit poles, residues and residual terms to the response of a band.
 
-    Order, noise, distortion and covariance are those of the section Model in the README of the
-    folder [Pintelon2012].
+    Order, noise, distortion and covariance are those of the section "Frequency responses" in the
+    README of the folder [Pintelon2012].
     """
     start = np.empty(0), (-FEWEST_POWERS, FEWEST_POWERS)
     state = _restart(_grow(_settle(ordinates, *start, ordinates.noise)))

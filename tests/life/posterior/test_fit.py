@@ -543,7 +543,7 @@ def test_without_weight_of_a_free_change_the_laws_are_alone(
 
 
 def test_a_wander_that_all_modes_have_in_common_is_no_health() -> None:
-    """Health of a machine that stays as it is holds; without it 13 of 28 intervals did."""
+    """Health of a machine that stays as it is holds; without it some intervals do not."""
     stage = load_stage("lms-y")
     life = structs.replace(stage.description.life, common_wander=0.0)
     without = replace(stage, description=structs.replace(stage.description, life=life))

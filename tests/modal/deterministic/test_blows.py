@@ -78,6 +78,19 @@ def test_overloaded_blows_are_refused(channel: int) -> None:
     )
 
 
+@pytest.mark.parametrize("sign", [1, -1])
+def test_a_force_that_rests_in_few_levels_is_no_overload(sign: int) -> None:
+    """Rounded to 1 N, or zero outside the pulses, and of either sign, no blow is refused."""
+    force, answer = strike(np.random.default_rng(1), Hammer(MODES, blows=4))
+    force *= sign * 300 / force.max()
+    in_newtons = np.round(force).astype(float)
+    for few in (in_newtons, np.where(np.abs(force) > 6, force, 0.0)):
+        log = make_log({"current_force": few, "acc": answer}, RATE)
+        reading = read_frf(log, "current_force", "acc", band=BAND)
+        assert reading.frf.n_averages == 4
+        assert reading.modes.frequency == pytest.approx([62.0, 130.0], rel=2e-3)
+
+
 def test_only_what_is_certain_is_taken_for_blows() -> None:
     """Noise, noise with a spike, a sweep and a train of equal pulses are none unless stated."""
     rng = np.random.default_rng(3)
