@@ -27,7 +27,7 @@ class UnknownLife(_Unknown):
 
 
 class UnknownStage(_Unknown):
-    """A stage that is neither lms-x nor lms-y."""
+    """A stage that is not registered."""
 
     noun = "stage"
 

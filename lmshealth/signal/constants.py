@@ -4,6 +4,12 @@
 # Change of the set velocity over this time in s, but at least so many samples, as a share of its
 # maximum, up to which it is constant.
 VELOCITY_LAG, LEAST_VELOCITY_LAG, VELOCITY_TOLERANCE = 1e-3, 20, 1e-3
+# A slow ramp changes by more than `SAME_VELOCITY` of the maximum from this time in s before to this
+# time after: ramps from rest within ten seconds are found.
+SLOW_RAMP_LAG = 0.1
+# Range in m of a set position within which a stage is at rest: above the noise of a measured
+# position, below every move of a stage whose strokes are millimetres and more.
+LEAST_MOVE = 1e-6
 # Time in s after a move in which the stage settles: some periods of its slowest modes and loop.
 SETTLING_TIME = 0.5
 # Relative difference up to which two set velocities are one: encoders measure them to a percent.

@@ -12,7 +12,8 @@ import numpy as np
 from scipy import fft
 
 from lmshealth._private.arrays import FloatArray, ReadOnly, freeze
-from lmshealth.errors import BadLog
+from lmshealth.errors import BadLog, BadQuestion
+from lmshealth.io.buffers import blocks
 from lmshealth.io.log import Channel, Log
 from lmshealth.signal import constants
 from lmshealth.signal.segments import (
@@ -22,6 +23,7 @@ from lmshealth.signal.segments import (
     find_segments,
     nominal_velocity,
     select_channels,
+    select_phases,
     select_segments,
 )
 from lmshealth.stage.description import Stage
@@ -135,11 +137,14 @@ def read_error(
     """Analyse the following error of a log, one reading per displacement channel [Piscalov2021].
 
     The `count` strongest harmonics are kept; those up to the floor in m are noise. `part` is a
-    motion phase, see `select_segments`. `BadLog`: ``too-short`` where the longest segment has fewer
-    than ``count`` harmonics, or as `select_channels` and `select_segments` do.
+    motion phase, see `select_segments`. `BadQuestion` if the count is below 1. `BadLog`:
+    ``too-short`` where the longest segment has fewer than ``count`` harmonics, or as
+    `select_channels` and `select_segments` do.
     """
+    if count < 1:
+        raise BadQuestion(f"count = {count}: needed is at least 1 harmonic")
     channels = select_channels(log, "displacement")
-    segments = select_segments(log, part)
+    phases, segments = select_phases(log, part), select_segments(log, part)
     longest = max(segments, key=lambda segment: segment.stop - segment.start)
     n, needed = longest.stop - longest.start, 2 * count + 1
     if n < needed:
@@ -147,11 +152,11 @@ def read_error(
         needs = f"{count} harmonics need {needed / log.sample_rate:.3g} s"
         raise BadLog(log.name, "too-short", f"{found}; {needs}: record longer or lower --count")
     velocity = nominal_velocity(log)
-    duration = sum(s.stop - s.start for s in segments) / log.sample_rate
+    duration = sum(s.stop - s.start for s in phases) / log.sample_rate
     readings = []
     for channel in channels:
         harmonics = decompose(channel.values[longest.start : longest.stop], log.sample_rate)
-        kept, statistics = harmonics.strongest(count), _statistics(channel, segments)
+        kept, statistics = harmonics.strongest(count), _statistics(channel, phases)
         readings.append(
             FollowingError(channel.name, velocity, duration, *statistics, harmonics, kept, floor)
         )
@@ -192,7 +197,7 @@ def _mean_square(values: FloatArray, sample_rate: float) -> float:
 
 def _statistics(channel: Channel, segments: Sequence[Segment]) -> tuple[float, float, float, float]:
     """Return minimum, maximum, standard deviation and mean of all samples."""
-    parts = (channel.values[s.start : s.stop] for s in segments)
+    parts = (x for s in segments for _, x in blocks(channel.values, s.start, s.stop))
     moments = [(x.size, x.min(), x.max(), x.mean(), x.var()) for x in parts]
     size, low, high, mean, var = np.array(moments).T
     total = float(np.average(mean, weights=size))
@@ -275,8 +280,22 @@ def choose_bands(
 
     Modes have the natural frequencies in Hz that were found in this log, by name, or else those of
     the description; the span in Hz is that of modes or grid frequencies. The order is modes or grid
-    ascending in frequency, then health band, then watched bands.
+    ascending in frequency, then health band, then watched bands. `BadQuestion` without any band.
     """
+    bands = _bands(stage, found, span)
+    if not bands:
+        low, high = span or constants.LEVEL_BAND_RANGE
+        raise BadQuestion(
+            f"no mode, nor a multiple of {constants.LEVEL_BAND_SPACING:g} Hz without a description,"
+            f" lies in {low:g} to {high:g} Hz: choose a wider band"
+        )
+    return bands
+
+
+def _bands(
+    stage: Stage | None, found: Mapping[str, float] | None, span: tuple[float, float] | None
+) -> tuple[FrequencyBand, ...]:
+    """Return the bands of `choose_bands`, which may be none."""
     if stage is None:
         step = constants.LEVEL_BAND_SPACING
         low, high = span or constants.LEVEL_BAND_RANGE
@@ -339,7 +358,7 @@ def _usable(log: Log, bands: Iterable[FrequencyBand], longest: int) -> list[Freq
     asked = tuple(bands)
     usable = [band for band in asked if band.high < log.sample_rate / 2]
     if not usable:
-        lowest = min((band.high for band in asked), default=np.nan)
+        lowest = min(band.high for band in asked)
         found = f"a sample rate of {log.sample_rate:g} Hz covers none of the bands"
         raise BadLog(log.name, "sample-rate", f"{found}; needed is more than {2 * lowest:.4g} Hz")
     narrowest = min(band.high - band.low for band in usable)

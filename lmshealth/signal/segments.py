@@ -9,7 +9,7 @@ import numpy as np
 
 from lmshealth._private.arrays import BoolArray, FloatArray
 from lmshealth.errors import BadLog
-from lmshealth.io.buffers import MINUTE, blocks
+from lmshealth.io.buffers import MINUTE, Samples, blocks
 from lmshealth.io.log import Channel, Log
 from lmshealth.signal import constants
 
@@ -51,19 +51,24 @@ def find_phases(log: Log) -> tuple[Segment, ...]:
         (float(np.abs(part).max()) for a, b in log.pieces for _, part in blocks(velocity, a, b)),
         default=0.0,
     )
+    if _range_of_position(log, velocity) < constants.LEAST_MOVE:
+        return tuple(Segment(start, stop, 0.0, "idle") for start, stop in log.pieces)
     settling = round(constants.SETTLING_TIME * log.sample_rate)
     phases: list[Segment] = []
     for start, stop in log.pieces:
         found: list[Segment] = []
-        # Between neighbouring samples a slow ramp appears constant.
+        # Between neighbouring samples a ramp appears constant.
+        most = max(1, (stop - start) // 4)
         lag = max(constants.LEAST_VELOCITY_LAG, round(constants.VELOCITY_LAG * log.sample_rate))
-        lag = max(1, min(lag, (stop - start) // 4))
+        lag = min(lag, most)
+        far = max(lag, min(round(constants.SLOW_RAMP_LAG * log.sample_rate), most))
         # A piece that begins at rest is idle.
         last_move = start - settling - 1
         for at, block in blocks(velocity, start, stop):
-            low, high = max(start, at - lag), min(stop, at + block.size + lag)
+            low, high = max(start, at - far), min(stop, at + block.size + far)
             inner = slice(at - low, at - low + block.size)
-            steady = _steady(velocity[low:high], lag, scale)[inner]
+            near = velocity[low:high]
+            steady = (_steady(near, lag, scale) & ~_on_slow_ramp(near, far, scale))[inner]
             moving = np.abs(block) > constants.VELOCITY_TOLERANCE * scale
             code = np.where(moving, steady.view(np.int8), np.int8(2))
             cuts = [0, *(np.flatnonzero(code[1:] != code[:-1]) + 1).tolist(), block.size]
@@ -148,6 +153,29 @@ def _steady(velocity: FloatArray, lag: int, scale: float) -> BoolArray:
     return steady
 
 
+def _on_slow_ramp(velocity: FloatArray, lag: int, scale: float) -> BoolArray:
+    """Return which samples have other velocities both ``lag`` samples before and after.
+
+    Where one of the two is beyond the ends, the other counts.
+    """
+    most = constants.SAME_VELOCITY * max(scale, 1e-12)
+    change = np.abs(velocity[lag:] - velocity[:-lag]) > most
+    before, after = np.ones((2, velocity.size), dtype=bool)
+    before[lag:], after[:-lag] = change, change
+    return np.asarray(before & after)
+
+
+def _range_of_position(log: Log, velocity: Samples) -> float:
+    """Return the range in m of the set position by a set velocity in m/s."""
+    position, ends = 0.0, [0.0]
+    for start, stop in log.pieces:
+        for _, part in blocks(velocity, start, stop):
+            path = position + np.cumsum(part) / log.sample_rate
+            position = float(path[-1])
+            ends += [float(path.min()), float(path.max())]
+    return max(ends) - min(ends)
+
+
 def _join(found: list[Segment], segment: Segment) -> None:
     """Append a segment, or extend the last one of the same kind."""
     if not found or found[-1].kind != segment.kind:
@@ -175,18 +203,25 @@ def select_segments(log: Log, part: Part) -> tuple[Segment, ...]:
 
     ``record`` is all of the log, acceleration and braking included; without a set point only it can
     be selected, also as ``constant``. The result is at least one segment, in order of time, each of
-    at most a minute at 20 kHz. `BadLog`: ``no-set-point`` where the set point is needed and
-    missing, ``no-such-part`` where the log has no such segment.
+    at most a minute at 20 kHz. `BadLog` as `select_phases`.
+    """
+    return tuple(cut for phase in select_phases(log, part) for cut in _parts(phase, MINUTE))
+
+
+def select_phases(log: Log, part: Part) -> tuple[Segment, ...]:
+    """Select as `select_segments` does, without cutting the segments.
+
+    `BadLog`: ``no-set-point`` where the set point is needed and missing, ``no-such-part`` where the
+    log has no such segment.
     """
     if part == "record" or (log.reference_velocity is None and part == "constant"):
-        pieces = [Segment(start, stop, float("nan")) for start, stop in log.pieces]
-        return tuple(cut for piece in pieces for cut in _parts(piece, MINUTE))
+        return tuple(Segment(start, stop, float("nan")) for start, stop in log.pieces)
     if log.reference_velocity is None:
         needed = "needed reference_position_mm or reference_velocity_mm_s"
         detail = f"no set point, which defines the part {part!r}; {needed}"
         raise BadLog(log.name, "no-set-point", detail)
     phases = find_phases(log)
-    chosen = tuple(cut for phase in phases if phase.kind == part for cut in _parts(phase, MINUTE))
+    chosen = tuple(phase for phase in phases if phase.kind == part)
     if not chosen:
         there = ", ".join(sorted({phase.kind for phase in phases}))
         raise BadLog(log.name, "no-such-part", f"no part of the log is {part}; there are: {there}")

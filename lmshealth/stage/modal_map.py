@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 from numpy.polynomial.chebyshev import chebder, chebvander
 
-from lmshealth._private.arrays import BoolArray, FloatArray
+from lmshealth._private.arrays import BoolArray, FloatArray, one_thread
 from lmshealth._private.files import read_table
 from lmshealth.errors import BadStage, OutsideMap
 from lmshealth.stage import constants
@@ -101,6 +101,7 @@ class ModalMap:
         return np.asarray(2 * (x - self.low) / (self.high - self.low) - 1)
 
 
+@one_thread
 def read_map(path: str, parameters: tuple[str, ...]) -> ModalMap:
     """Read a modal map and fit its surrogate.
 

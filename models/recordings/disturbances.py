@@ -1,7 +1,7 @@
 """What shakes a moving stage: friction, guide roughness, ground, orders of the velocity, mains.
 
 The paper states none of these levels: they are fitted to its Tables 3, 4, 6 and 7, see the study
-``paper_tables``.
+``paper/tables``.
 """
 
 from __future__ import annotations

@@ -9,7 +9,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from lmshealth.errors import BadLog
+from lmshealth.errors import BadLog, BadQuestion
 from lmshealth.io.log import Log, Metadata
 from lmshealth.io.reading import read_log
 from lmshealth.modal.identification import identify
@@ -120,6 +120,12 @@ def test_without_a_stage_there_is_the_papers_grid() -> None:
     assert [band.name for band in grid] == [f"{f} Hz" for f in range(10, 401, 10)]
     assert (grid[0].low, grid[0].high) == (5.0, 15.0)
     assert [b.name for b in choose_bands(None, None, (0, 25))] == ["10 Hz", "20 Hz"]
+
+
+def test_a_range_without_a_band_is_refused() -> None:
+    """Neither the grid nor a description has a frequency there: the range is stated."""
+    with pytest.raises(BadQuestion, match="82 to 88 Hz: choose a wider band"):
+        choose_bands(None, None, (82.0, 88.0))
 
 
 def test_a_stage_has_modes_health_band_and_watched_bands() -> None:

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lmshealth.errors import BadLog
+from lmshealth.errors import BadLog, BadQuestion
 from lmshealth.io.reading import read_log
 from lmshealth.signal.readings import loop_error, read_error
 from models.dynamics.stages import STAGES
@@ -91,6 +91,23 @@ def test_a_part_of_the_log_can_be_read() -> None:
     log = make_log({"delta_e": x}, RATE, velocity=velocity)
     assert read_error(log, part="idle")[0].std == pytest.approx(1e-8, rel=0.1)
     assert read_error(log, part="constant")[0].std == pytest.approx(1e-5, rel=0.1)
+
+
+def test_statistics_and_duration_are_of_all_samples() -> None:
+    """A record of more than a minute is cut into parts for the spectra, not for its extremes."""
+    values = np.random.default_rng(2).normal(0, 1e-6, 1_300_019)
+    values[-300:] += 5e-4
+    (reading,) = read_error(make_log({"delta_e": values}, 20_000.0))
+    assert reading.duration == values.size / 20_000
+    assert reading.highest == values.max()
+    assert reading.mean == pytest.approx(values.mean())
+    assert reading.std == pytest.approx(values.std())
+
+
+def test_without_a_harmonic_there_is_no_reading() -> None:
+    """A count below one is an error that states what is needed."""
+    with pytest.raises(BadQuestion, match="at least 1"):
+        read_error(make_log({"delta_e": np.ones(100)}, RATE), count=0)
 
 
 def test_a_log_without_following_error_is_refused() -> None:

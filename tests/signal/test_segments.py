@@ -58,6 +58,27 @@ def test_a_stroke_has_all_its_parts() -> None:
     assert (record.start, record.stop) == (0, log.channels[0].values.size)
 
 
+@pytest.mark.parametrize("seconds", [0.5, 1.5, 5.0])
+def test_a_slow_ramp_is_no_constant_velocity(seconds: float) -> None:
+    """The speed of a log is that of its plateau, however slowly it is reached."""
+    ramp = np.linspace(0, 0.1, round(seconds * RATE))
+    log = log_of(np.concatenate([np.zeros(500), ramp, np.full(5000, 0.1), ramp[::-1]]))
+    (constant,) = select_segments(log, "constant")
+    assert constant.start == pytest.approx(500 + ramp.size, abs=0.02 * ramp.size + 20)
+    assert constant.stop - constant.start == pytest.approx(5000, abs=0.04 * ramp.size + 40)
+    assert nominal_velocity(log) == pytest.approx(0.1, rel=2e-3)
+
+
+def test_a_set_point_that_trembles_is_at_rest() -> None:
+    """A position within 1 µm is no move, whatever its velocities are; a move of 10 µm is one."""
+    rng = np.random.default_rng(4)
+    trembling = np.gradient(1e-9 * rng.standard_normal(20_000), 1 / RATE)
+    (idle,) = find_phases(log_of(trembling))
+    assert (idle.start, idle.stop, idle.kind, idle.velocity) == (0, 20_000, "idle", 0.0)
+    creeping = trembling + np.where(np.arange(20_000) < 10_000, 1e-6, 0.0)
+    assert "ramp" in {phase.kind for phase in find_phases(log_of(creeping))}
+
+
 def test_without_a_set_point_there_is_the_whole_record_only() -> None:
     """Record and constant velocity are everything; settling needs the set point."""
     log = log_of(None)

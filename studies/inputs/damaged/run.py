@@ -3,7 +3,7 @@
 Method
     Four simulated recordings are written a thousand times, each with a thousandth of fresh noise
     and the next moment of a machine's life, in seven formats in turn. Among them are damaged logs
-    of every kind in `KINDS` of `damage.py`, which states the reason of each, once in each format
+    of every kind in `KINDS` of `kinds.py`, which states the reason of each, once in each format
     that can be damaged so. One `lmshealth run` with two workers. Damage of a channel
     or a stretch must leave the rest of its log analysed. Damage that no file shows is left out:
     flipped bits without a checksum, text cut between rows or inside the last number. The exit

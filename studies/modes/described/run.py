@@ -13,7 +13,7 @@ Method
     described modes, on the same records. Controls: intervals two thirds as wide, which must not
     cover; the code before, which must miss the bound.
 Run time
-    A quarter of an hour on one processor.
+    An hour on two shared processors.
 """
 
 from __future__ import annotations

@@ -15,7 +15,7 @@ Method
     against published values, sides and experiments against each other, noise-only uncertainty
     against the jackknife over periods.
 Run time
-    Eleven minutes on one processor. The benches need LMSHEALTH_DATA.
+    50 minutes on two shared processors, 21 of them computing. The benches need LMSHEALTH_DATA.
 """
 
 from __future__ import annotations

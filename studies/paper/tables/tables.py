@@ -16,6 +16,7 @@ from scipy.signal import find_peaks
 from models.dynamics.equations import controller
 from models.dynamics.margins import cases, margin_record
 from models.dynamics.plant import closed_loop_modes
+from models.dynamics.servo import MEASURED
 from models.dynamics.stages import Stage, stage_named
 from models.recordings.recording import Recording, record
 from models.recordings.strokes import VELOCITIES, full_stroke, record_strokes
@@ -164,21 +165,23 @@ def velocity_rows(
 
 
 def loop_rows(plant: str) -> list[TableRow]:
-    """Return Table 1: margins with the flexible modes inside, filters from equations 8 and 9.
+    """Return Table 1: margins with the flexible modes inside, and settings of the controller.
 
-    Of the rigid stages the loop is that of the corrected equations, of the full that of the drive.
+    Of the rigid stages the loop is that of the corrected equations, with the settings of equations
+    8 and 9; of the full that of the drive, with its settings.
 
-    The velocity loop's P stands in the equations only as a product with a scale, so that they tell
-    I/P alone.
+    The velocity loop's P stands in the equations only as a product with a scale, so that I/P alone
+    follows from them.
     """
     table = printed(1).set_index("parameter")
     ratio = table.loc["velocity_loop_i"] / table.loc["velocity_loop_p"]
     table.loc["velocity_loop_i_over_p"] = ratio
     found: dict[str, list[float]] = {}
-    for axis, name in FILES.items():
+    for axis in FILES:
+        name = stage_of(axis, plant).name
         (loop,) = (
             row
-            for row in map(margin_record, cases(stage_of(axis, plant).name))
+            for row in map(margin_record, cases(name))
             if row["structure"] == "flexible" and row["reading"] in ("corrected", "measured")
         )
         gain = next(c for c in loop["crossovers"] if c["phase_margin_deg"] is not None)
@@ -198,7 +201,18 @@ def loop_rows(plant: str) -> list[TableRow]:
 
 
 def _controller_numbers(stage: str) -> dict[str, float]:
-    """Return Table 1's settings as the roots of the corrected equations (8) and (9) tell them."""
+    """Return Table 1's settings: of a full stage those of its drive, else by the equations.
+
+    Those of a rigid stage are computed from the roots of the corrected equations (8) and (9).
+    """
+    if stage in MEASURED:
+        tuning = MEASURED[stage]
+        return {
+            "lpf_cutoff_hz": tuning.low_pass_hz,
+            "notch_frequency_hz": min(section.frequency_hz for section in tuning.sections),
+            "position_loop_p": tuning.position_gain,
+            "velocity_loop_i_over_p": tuning.velocity_i / tuning.velocity_p,
+        }
     law = controller(stage, "corrected")
     zeros, poles = np.asarray(law.zeros()), np.asarray(law.poles())
     real = np.sort(np.abs(zeros[np.abs(zeros.imag) < 1e-3 * np.abs(zeros)].real))
