@@ -237,4 +237,4 @@ def both(seed: int = 1, n: int = 60_000, noise: float = 0.5, psd: float = 1.0) -
 
 def as_if_white(_: Likelihood, __: np.ndarray, white: Marginal, *___: float) -> Colour:
     """Leave the posterior as it is for a white force."""
-    return Colour(white.mean, white.cov, 0.0)
+    return Colour(white.mean, white.cov, np.zeros_like(white.cov), 0.0)

@@ -20,6 +20,7 @@ LEVEL_STD, DAMPING_STD, DAMPING_WALK = 0.1, 1.0, 0.5
 # Logs in a life, and until ln f has settled; what modes have in common of the variances of rates
 # and of wander.
 LIFE, SETTLING_LOGS, COMMON_RATE, COMMON_WANDER = 150, 1.0, 0.9, 0.3
+KNOWN_RATE_LOGS = 10  # from which on a rate keeps its value when the mean distance changes
 BIAS = (0.005, 0.2)
 UNSEEN_STD = 0.03  # of ln f by a covariate of which no value is known yet
 # Standard deviations of the jumps of ln f and ln ζ.
@@ -98,17 +99,54 @@ class Followed:
     nis: FloatArray
 
 
+def distances(history: History) -> list[float]:
+    """Give the mean distance of the logs so far, at each log."""
+    clock, means, count = history.clock() - history.clock()[0], [0.0], 0
+    for k in range(1, clock.size):
+        there = bool(np.isfinite(history.ln_frequency[k]).any())
+        count += there
+        means.append(float(clock[k]) / count if there else means[-1])
+    return means
+
+
 def lives(history: History) -> FloatArray:
     """Give the lives gone by at each log: their unit is the mean distance of logs so far."""
-    clock, gone, before, count = history.clock() - history.clock()[0], [0.0], 0.0, 0
-    for k in range(1, clock.size):
+    clock, gone, before = history.clock() - history.clock()[0], [0.0], 0.0
+    for k, mean in enumerate(distances(history)[1:], start=1):
         more = 0.0
         if np.isfinite(history.ln_frequency[k]).any():
-            count += 1
-            mean = clock[k] / count
             more, before = (clock[k] - before) / mean / LIFE if mean else 0.0, clock[k]
         gone.append(gone[-1] + more)
     return np.array(gone, dtype=np.longdouble)
+
+
+def longer(history: History, k: int) -> float:
+    """Give by how much a life of log k is longer than one of the log before, and a rate larger."""
+    n = np.count_nonzero(np.isfinite(history.ln_frequency[1:k]).any(axis=1))
+    before, now = distances(history)[k - 1 : k + 1]
+    return now / before if n >= KNOWN_RATE_LOGS and now and before else 1.0
+
+
+def by_rate(history: History, wander: Wander, start: int) -> np.ndarray:
+    """Give the change of ln f at each log per rate at a log, which is per life of that log."""
+    t, moved, rate = lives(history), np.zeros(len(history.logs), dtype=np.longdouble), 1.0
+    for k in range(start + 1, moved.size):
+        rate *= longer(history, k)
+        moved[k] = moved[k - 1] + rate * wander.moved(t[k] - t[k - 1])
+        rate *= float(np.exp(-wander.decay * (t[k] - t[k - 1])))
+    return moved
+
+
+def bent(history: History) -> np.ndarray:
+    """Give the covariance of ln f by a random walk of rates of variance 1 per life, ``(n, n)``."""
+    t, n = lives(history), len(history.logs)
+    total = np.zeros((n, n), dtype=np.longdouble)
+    for j in range(1, n):  # what begins between two logs goes on with the rate that it has then
+        tick, since = t[j] - t[j - 1], by_rate(history, Wander(0.0, 0.0, 0.0, {}), j)
+        there = (np.arange(n) >= j).astype(np.longdouble)
+        total += tick**3 / 3 * np.outer(there, there) + tick * np.outer(since, since)
+        total += tick**2 / 2 * (np.outer(there, since) + np.outer(since, there))
+    return total
 
 
 def _alike(common: float, n: int) -> FloatArray:
@@ -160,7 +198,9 @@ def _data(
             cov[a, c] *= wander.scales[history.series[a % r].source]
             cov[a, c] *= wander.scales[history.series[c % r].source]
     for a in range(r):
-        cov[a, a] += _unknown(history, known, k)
+        for c in range(r):
+            alike = history.series[a].mode == history.series[c].mode
+            cov[a, c] += _unknown(history, known, k) if alike else 0.0
     rows = np.flatnonzero(~np.isnan(values))
     return values[rows], cov[np.ix_(rows, rows)], rows
 
@@ -221,7 +261,10 @@ class Textbook:
             gone, m = lives(history), len(history.modes)
             tick = float(gone[k] - gone[k - 1])
             level, rate, own = self.all("level"), self.all("rate"), self.all("wander")
-            far, left = float(wander.moved(np.array(tick))), np.exp(-wander.decay * tick)
+            # A rate is that per life of the log before.
+            more = longer(history, k)
+            far = more * float(wander.moved(np.array(tick)))
+            left = more * np.exp(-wander.decay * tick)
             # A rate that is unknown anew is so from the log before on.
             anew = wander.rate**2 * (k in self.known.reopened)
             alike = _alike(COMMON_RATE, m)
@@ -340,19 +383,18 @@ def filterpy_loop(history: History, wander: Wander, known: Known) -> Followed:
 def _levels(history: History, wander: Wander, known: Known) -> list[np.ndarray]:
     """Covariance of ln f, of ln ζ, and between ln f of two modes, over all logs, ``(n, n)`` each.
 
-    With t the lives since the first log, that of ln f is
-    σ² + σ_r² t t' + walk min(t, t') + bend min² (3 max − min)/6 + Σ jump² where both come after it.
+    With t the lives since the first log, and c the change by a rate, that of ln f is
+    σ² + σ_r² c c' + walk min(t, t') + bend + Σ jump² where both come after it.
     """
     t = lives(history)
-    low, high = np.minimum.outer(t, t), np.maximum.outer(t, t)
-    rates = wander.rate**2 * np.outer(wander.moved(t), wander.moved(t))
-    rates += wander.bend**2 * low**2 * (3 * high - low) / 6
+    low, moved = np.minimum.outer(t, t), by_rate(history, wander, 0)
+    rates = wander.rate**2 * np.outer(moved, moved) + wander.bend**2 * bent(history)
     settled = wander.settled(history)
     rates += np.minimum.outer(settled, settled)
     level = LEVEL_STD**2 + wander.level**2 * low
     damping = DAMPING_STD**2 + DAMPING_WALK**2 * low
     for k in known.reopened:
-        since = wander.moved(np.maximum(t - t[k - 1], 0.0))
+        since = by_rate(history, wander, k - 1)
         rates += wander.rate**2 * np.outer(since, since)
     for step in history.steps:
         if step.kind in ("step", "regreasing", "reset"):

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy import stats
 
+from lmshealth._private.arrays import finite_or_none
 from lmshealth._private.files import write_text
 from lmshealth._private.tables import TABLES, Row
 from lmshealth.calibration import constants
@@ -63,10 +64,13 @@ class Share:
     high: float
     stated: float | None = None
     side: Literal["as", "most", "least"] = "as"
+    rejected: bool | None = None  # by a rule over all checks; None where no rule has judged it
 
     @property
     def missed(self) -> bool:
-        """Whether the interval lies on the wrong side of what is stated."""
+        """Whether it is rejected; without a rule, whether its interval is on the wrong side."""
+        if self.rejected is not None:
+            return self.rejected
         if self.stated is None:
             return False
         above, below = self.low > self.stated, self.high < self.stated
@@ -226,11 +230,13 @@ def _expectations(check: CalibrationCheck, quantities: Sequence[str]) -> Block:
                 _spelled(quantity).capitalize(),
                 [
                     Share(f"{one.kind}, {100 * one.level:.0f} %", one.share, one.low, one.high,
-                          one.level)
+                          one.level, rejected=one.verdict != "as stated")
                     for one in check.coverage
                     if one.quantity == quantity
                 ],
-                f"Good: both “as described” bars reach their dashed lines. {_of_kinds(quantity)}",
+                "Good: no “as described” bar is red. A bar is red if the table calls its intervals "
+                "too narrow or too wide; a blue one may miss its dashed line by chance. "
+                f"{_of_kinds(quantity)}",
                 salt=f"coverage-{k}",
             )
             for k, quantity in enumerate(quantities)
@@ -314,7 +320,8 @@ def _detection(check: CalibrationCheck) -> Block:
     ]  # fmt: skip
     false = [one for one in check.rates if "(false)" in one.what or one.at_most is not None]
     alarms = [
-        Share(f"{o.kind}: {o.what}"[:70], o.share, o.low, o.high, o.at_most, "most") for o in false
+        Share(f"{o.kind}: {o.what}"[:70], o.share, o.low, o.high, o.at_most, "most", o.exceeded)
+        for o in false
     ]
     pictures = []
     if rows:
@@ -324,7 +331,10 @@ def _detection(check: CalibrationCheck) -> Block:
         )
         pictures.append(share_picture("Losses that are reported", rows, caption, salt="losses"))
     if alarms:
-        caption = "Good: near 0 %, and no bar wholly right of its dashed line, if it has one."
+        caption = (
+            "Good: near 0 %, and no bar is red. A bar is red if by the rule over all checks its "
+            "share is above its dashed line; a blue one may be so by chance."
+        )
         pictures.append(
             share_picture("False alarms and late dates", alarms, caption, salt="false", wide=True)
         )
@@ -373,12 +383,13 @@ def life_rows(check: CalibrationCheck) -> list[Row]:
     found = []
     for one in check.outcomes:
         common = one.kind, one.drawn, one.number
-        end = one.verdict or None, one.alarm, one.service or None, one.wait, one.failed or None
-        own = [
-            table.row(*common, name, one.truth[name], *values, one.places[name], *end)
-            for name, values in one.quantiles.items()
-        ]
-        found += own or [table.row(*common, *([None] * 8), *end)]
+        wait = finite_or_none(one.wait)
+        end = one.verdict or None, one.alarm, one.service or None, wait, one.failed or None
+        for name, values in one.quantiles.items():
+            known = map(finite_or_none, (one.truth[name], *values))
+            found.append(table.row(*common, name, *known, one.places[name], *end))
+        if not one.quantiles:
+            found.append(table.row(*common, *([None] * 8), *end))
     return found
 
 

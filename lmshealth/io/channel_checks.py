@@ -240,13 +240,21 @@ def independent(columns: Sequence[Samples], ranges: _Ranges, most: int) -> list[
     of at most so many; a channel that the others determine is not among them.
     """
     gram = np.zeros((len(columns), len(columns)))
+    length = constants.COMPARED // 8
     for start, stop in ranges:
         for at in range(start, stop, BLOCK):
-            part = np.stack([c[at : min(at + constants.COMPARED, stop)] for c in columns])
-            part -= part.mean(axis=1, keepdims=True)
-            gram += part @ part.T
-    scale = np.sqrt(np.diagonal(gram).clip(np.finfo(float).tiny))
-    return pivots(gram / scale[:, None] / scale, most, least=constants.DEPENDENT)
+            end = min(at + BLOCK, stop)
+            # A coarse channel is constant for as long as the machine rests.
+            for k in places(end - at, length):
+                part = np.stack([c[at + k : min(at + k + length, end)] for c in columns])
+                part -= part[:, :1]  # the mean of equal samples may be rounded
+                part -= part.mean(axis=1, keepdims=True)
+                gram += part @ part.T
+    size = np.diagonal(gram)
+    scale = np.sqrt(size.clip(np.finfo(float).tiny))
+    order = pivots(gram / scale[:, None] / scale, most, least=constants.DEPENDENT)
+    # Channels that are constant in all stretches may differ elsewhere.
+    return [*order, *np.flatnonzero(size == 0).tolist()][:most]
 
 
 def magnitudes(columns: Sequence[Samples], ranges: _Ranges) -> dict[int, list[int]]:

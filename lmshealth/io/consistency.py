@@ -70,7 +70,7 @@ def compare(
     happens too often to cut the record.
     """
     size = measured[0].size
-    ranges = np.concatenate([_repeats(measured), _held(measured)])
+    ranges = np.concatenate([_repeats(measured), _held(measured, breaks)])
     copies = runs(within(ranges, 0, size)) if len(ranges) else NO_RANGES
     notes: list[tuple[str, str, str]] = []
     if n_lost := count(copies):
@@ -102,7 +102,7 @@ def _moved(
         dropped = dropped if fine else _jumps(position, own)
     elif nominal:
         notes += _speed_notes(own, abs(nominal), rate)
-    dropped = dropped[(np.abs(dropped[:, None] - known) > 1).all(axis=1)]
+    dropped = dropped[~np.isin(dropped, np.concatenate([known - 1, known, known + 1]))]
     if dropped.size:
         found = f"the set position jumps {dropped.size} times: samples were dropped there"
         # At rest they are not seen.
@@ -300,12 +300,12 @@ def _rounding(velocity: Samples, expected: FloatArray) -> float:
     return float(resolution(levels) / 2 / np.quantile(levels, 0.9)) if levels.any() else 0.0
 
 
-def _held(measured: Sequence[Samples]) -> IntArray:
+def _held(measured: Sequence[Samples], breaks: IntArray) -> IntArray:
     """Find stretches in which all of several channels hold one value, ``(n, 2)``, ascending."""
     # A driver that loses its data may write zeros, or the last sample: signals jump at the
     # ends of a stretch. They do not where a machine stands still, and its channels are
-    # coarse. A record that is held for most of its time, and never for long, has another
-    # clock.
+    # coarse; at an end of a piece only one end of a rest is seen. A record that is held for
+    # most of its time, and never for long, has another clock.
     size, least = measured[0].size, constants.SHORTEST_REPEAT - 1
     if len(measured) < 2:
         return NO_RANGES
@@ -321,23 +321,33 @@ def _held(measured: Sequence[Samples]) -> IntArray:
     # A slower clock holds samples for most of the time, and never for long.
     slow = n_held > size / 2 and np.diff(held, axis=1).max(initial=0) < constants.SLOW_CLOCK
     by_chance = -np.log(chance) * least < constants.CHANCE
-    if not len(held) or by_chance or slow or not _jump_at_ends(measured, held, same):
+    if not len(held) or by_chance or slow:
         return NO_RANGES
-    return np.asarray(held)
+    jumps = _jumps_at_ends(measured, held, same, breaks).max(axis=1)
+    seen = np.isfinite(jumps)
+    lost = seen.any() and np.median(jumps[seen]) > constants.HELD_JUMP
+    return np.asarray(held[seen] if lost else NO_RANGES)
 
 
-def _jump_at_ends(measured: Sequence[Samples], held: IntArray, same: BoolArray) -> bool:
-    """Return whether a channel jumps at most ends of stretches, in terms of its usual values."""
-    size = measured[0].size
-    found = np.zeros(len(held))
+def _jumps_at_ends(
+    measured: Sequence[Samples], held: IntArray, same: BoolArray, breaks: IntArray
+) -> FloatArray:
+    """Return the largest jump of a channel at both ends of stretches, ``(n, 2)``.
+
+    In standard deviations of its other samples; NaN where no samples are, or time is interrupted.
+    """
+    # The first sample of a stretch is no repeat.
+    ends = held - [1, 0]
+    outside = (ends < 1) | (ends >= measured[0].size) | np.isin(ends, breaks)
+    found = np.where(outside, np.nan, 0.0)
+    inside = np.flatnonzero(~outside)
     for one in measured:
         parts = [block[~same[at : at + block.size]] for at, block in blocks(one)]
-        spread = max(float(np.concatenate(parts).std()), np.finfo(float).tiny)
-        for k, (start, stop) in enumerate(held.tolist()):
-            ends = [(i - 1, i) for i in (start - 1, stop) if 0 < i < size]
-            jumps = (abs(float(one[b : b + 1][0]) - float(one[a : a + 1][0])) for a, b in ends)
-            found[k] = max(found[k], max(jumps, default=0.0) / spread)
-    return bool(np.median(found) > constants.HELD_JUMP)
+        spread = max(float(np.nanstd(np.concatenate(parts))), np.finfo(float).tiny)
+        for k in inside:
+            before, after = one[ends.flat[k] - 1 : ends.flat[k] + 1]
+            found.flat[k] = np.maximum(found.flat[k], abs(after - before) / spread)
+    return found
 
 
 def _repeats(measured: Sequence[Samples]) -> IntArray:
@@ -352,10 +362,13 @@ def _repeats(measured: Sequence[Samples]) -> IntArray:
     size = values.size
     found: list[tuple[int, int]] = []
     end = n_periodic = 0
+    # Ends of the last stretches of each lag: all samples of a stretch have the same ends.
+    judged = dict[int, int]()
     for at, lag in _alike(values):
-        if at < end:
+        if at < max(end, judged.get(lag, 0)):
             continue
         start, stop = _extent(measured, at, lag)
+        judged[lag] = stop
         if stop - start >= constants.SHORTEST_REPEAT and not _by_chance(measured, start, stop, lag):
             found.append((max(start, end), stop))
             end = stop
@@ -372,6 +385,8 @@ def _alike(values: Samples) -> Iterator[tuple[int, int]]:
     for at, block in blocks(values, overlap=_KEY):
         bits = np.ascontiguousarray(block).view(np.uint64) * _FACTORS[0]
         k = np.flatnonzero(bits[: bits.size - _KEY] < (1 << 64) // _SELECTED)
+        # Of a constant value, which may go on for hours, the first.
+        k = k[(k == 0) | (bits[k] != bits[k - 1])]
         key = np.zeros(k.size, dtype=np.uint64)
         for i, factor in enumerate(_FACTORS):
             key += (bits[k + i] >> np.uint64(7)) * factor

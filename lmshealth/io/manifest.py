@@ -148,6 +148,10 @@ def read_rows(path: Path, needed: Sequence[str]) -> "pd.DataFrame":
                 table = read(header=0, names=[*range(n + 1)])
     except (ValueError, pd.errors.ParserWarning) as error:
         raise BadTable(f"{path}: cannot be read as a table: {str(error).strip()}") from error
+    text = content.removeprefix(codecs.BOM_UTF8).splitlines()
+    places = [k for k, line in enumerate(text, -1) if line.strip()][1:]
+    if len(places) == len(table):  # no cell has several lines
+        table.index = pd.Index(places)
     filled = table.apply(lambda cells: cells.str.strip() != "")
     if (beyond := filled.iloc[:, n:].any(axis=1)).any():
         raise BadTable(f"{path}, {lines(table, beyond)}: {n + 1} cells in {n} columns")

@@ -20,7 +20,7 @@ from lmshealth.io.column_map import ColumnMap, ColumnsGiven, Role, Signal, colum
 from lmshealth.io.consistency import compare
 from lmshealth.io.formats.content import Content, frequency_column, over_frequency
 from lmshealth.io.formats.registry import load
-from lmshealth.io.log import Channel, ChannelKind, Log, Metadata, Refusal, parse_metadata
+from lmshealth.io.log import Channel, ChannelKind, Log, Metadata, Refusal, as_text, parse_metadata
 from lmshealth.io.refusal import Unusable, listed, nearest, repeated, shown, visible
 from lmshealth.io.time_axis import Ranges, TimeAxis
 
@@ -34,7 +34,7 @@ def read_log(
     path: str | Path,
     *,
     columns: ColumnsGiven | None = None,
-    overrides: Mapping[str, str] | None = None,
+    overrides: Mapping[str, object] | None = None,
     name: str | None = None,
     max_memory: float = constants.MAX_MEMORY,
     latest: datetime | None = None,
@@ -48,8 +48,9 @@ def read_log(
     columns : ColumnMap, mapping, str or Path, optional
         How an export is read: a column map, its tables as in the file (``{"columns": {"delta_e_um":
         "PE(0)"}}``), or its file. By default the columns are those of the log contract.
-    overrides : mapping of str to str, optional
-        Metadata of a manifest, which override those of the file and the column map.
+    overrides : mapping of str to object, optional
+        Metadata of a manifest, which override those of the file and the column map. Values are
+        text, numbers or dates; empty ones and None override nothing.
     name : str, optional
         Name of the log in results; by default the path.
     max_memory : float, optional
@@ -68,7 +69,7 @@ def read_log(
     Raises
     ------
     BadLog
-        For every fault of the file; the reasons are listed in the README of this folder.
+        For every fault of the file; ``lmshealth/report/REFUSALS.md`` lists the reasons.
     BadTable
         For a column map that breaks its contract.
 
@@ -94,7 +95,8 @@ def read_log(
     used = column_map(columns)
     try:
         content = load(Path(path), used, max_memory)
-        filled_in = {key: value for key, value in (overrides or {}).items() if value.strip()}
+        given = {k: as_text(own) for k, own in (overrides or {}).items() if own is not None}
+        filled_in = {key: text for key, text in given.items() if text.strip()}
         stated = content.metadata | used.constants() | filled_in
         return _to_log(content, used, parse_metadata(stated, latest), name=label, digest=digest)
     except Unusable as error:
@@ -171,8 +173,10 @@ def _to_log(
     if not any(channel.kind in _DYNAMIC for channel in channels):
         raise Unusable("no-signal", f"no usable channel is left: {_why(refused)}")
     references = [one for role in _REFERENCES for one in series if one.signal.role == role]
+    gone = None
+    while references and (gone := _missing(*references[0], refused)) is None:
+        del references[0]
     reference = references[0] if references else None
-    gone = _missing(*reference, refused) if reference else None
     missing += [] if gone is None else [gone]
     # A set point over a rate that varies is no witness of one rate.
     witness = {} if axis.clocks else {one.signal.role: one.values for one in references}
@@ -186,7 +190,7 @@ def _to_log(
     if not ranges:
         raise Unusable("no-signal", f"no two samples in a row are complete; {_why(refused)}")
     channels = _without_copies(channels, ranges, refused)
-    set_point = reference.values if reference and gone is not None else None
+    set_point = reference.values if reference else None
     if axis.clocks:
         channels, set_point, ranges = _at_one_rate(channels, set_point, ranges, axis)
     if reference and set_point is not None and reference.signal.role == "reference_position":

@@ -246,7 +246,7 @@ class Summary:
     description: str  # digest of the stage description
     n_logs: int
     travel: float  # odometer at the last log in m, NaN without one
-    state: State  # ``good``, ``bad`` or ``open`` (no verdict)
+    state: State  # ``good``, ``bad`` or ``open`` (no clear verdict)
     alarmed: tuple[str, ...]  # as `Assessment.alarmed`
     lost: tuple[str, ...]  # parameters that the verdict reports as degraded
     verdict: str  # verdict, probability, why: as in `Verdict`

@@ -376,7 +376,8 @@ _WORDS = (
 def file_names(identities: Iterable[str]) -> dict[str, str]:
     """Name the pages of machines: valid on every file system and unique regardless of case.
 
-    A machine whose identity is such a name has that, unless another differs from it by case only.
+    A machine whose identity is such a name has that, unless it is the name of another page, or
+    differs from it by case only.
     """
     taken = {"index", "how-to-read"}
     stems = {}
@@ -384,7 +385,15 @@ def file_names(identities: Iterable[str]) -> dict[str, str]:
         stem = re.sub(r"[^\w.-]+", "-", identity).strip("-._")[:_NAME_LENGTH] or "stage"
         is_device = _DEVICES.fullmatch(stem.split(".")[0])
         stems[identity] = f"stage-{stem}" if is_device else stem
-    in_order = sorted(stems, key=lambda identity: (stems[identity] != identity, identity))
+    # What must be numbered is last: it takes no name that is the identity of another machine.
+    own = [identity.casefold() for identity, stem in stems.items() if identity == stem]
+    claims = Counter([*taken, *own])
+
+    def order(identity: str) -> tuple[bool, bool, str]:
+        stem = stems[identity]
+        return stem != identity, claims[stem.casefold()] > 1, identity
+
+    in_order = sorted(stems, key=order)
     return {identity: f"{free_name(stems[identity], taken)}.html" for identity in in_order}
 
 

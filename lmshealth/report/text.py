@@ -6,7 +6,7 @@ They are those of the language of `report.language`: English on terminals.
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
-from datetime import date, datetime
+from datetime import UTC, date, datetime
 from string import Formatter
 from typing import TYPE_CHECKING, Any, get_args
 
@@ -27,8 +27,6 @@ GAP = "\u202f"  # narrow no-break space between a number and its unit, and betwe
 _UNITS = {"c": "°C", "kg": "kg", "mm": "mm", "db": "dB", "percent": "%"}
 
 Number = float | np.floating[Any]
-
-day = tr_day  # of a date, or of a moment
 
 # Names in the shipped descriptions, and of covariates.
 _NAMES = (
@@ -93,17 +91,31 @@ def reason_and_code(code: str) -> str:
     return code if tr(code) == code else f"{tr(code)} ({code})"
 
 
+def day(when: date) -> str:
+    """Format a day of the calendar, of a moment its day in UTC."""
+    return tr_day(_day(when))
+
+
 def moment(when: datetime) -> str:
     """Format date, time and zone."""
-    return f"{day(when)} {when:%H:%M %Z}".strip()
+    return f"{tr_day(when)} {when:%H:%M %Z}".strip()
+
+
+def utc_moment(when: datetime) -> str:
+    """Format date and time in UTC, beside an age, which is counted in these days."""
+    return moment(when.astimezone(UTC))
 
 
 def age(last: date, today: date) -> str:
     """Return for how many days (UTC) there has been no log on a day; empty on that of the log."""
-    n = (today - (utc_day(last) if isinstance(last, datetime) else last)).days
+    n = (today - _day(last)).days
     if n < 1:
         return ""
     return tr_either("no log for {n} day", "no log for {n} days", n).format(n=_grouped(n))
+
+
+def _day(when: date) -> date:
+    return utc_day(when) if isinstance(when, datetime) else when
 
 
 def number(value: Number, digits: int = 3) -> str:
@@ -341,7 +353,7 @@ def headline(summary: Summary) -> str:
     """
     if summary.unknown:
         since = utc_day(summary.recorded_at)
-        past = age(summary.recorded_at, summary.today or since)
+        past = age(since, summary.today or since)
         return tr("Unknown since {day}: {past}", day=day(since), past=past)
     if summary.verdict == "healthy" and summary.step.kind in ("service-now", "overdue"):
         return tr("Healthy at the last log, but the service is due")

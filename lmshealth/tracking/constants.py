@@ -90,6 +90,10 @@ JUMP_STD: dict[str, tuple[float, float]] = {
 # --- Process noise, averaged over its evidence (maximum likelihood collapses to none) -------------
 # A life of the tracker is the clock of so many logs at their mean distance so far.
 LOGS_PER_LIFE = 150
+# Logs from which on a rate keeps its value when their mean distance, and with it the unit of rates,
+# changes. Before, it is known little better than by its prior, which is per life of now: of a few
+# logs of the first day, followed by one a month, the prior would be thirty times too wide.
+KNOWN_RATE_LOGS = 10
 # Random walk of ln f of a healthy machine, which has no rate, with probabilities.
 HEALTHY_WALKS = ((1e-5, 0.3), (3e-4, 0.25), (1e-3, 0.25))
 # A new or repaired machine may run in: its rate decays within so many logs, with probabilities,

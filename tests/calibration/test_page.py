@@ -6,21 +6,26 @@ import csv
 import json
 import re
 from pathlib import Path
+from typing import Any
 
+import msgspec
 import numpy as np
 import pytest
 
 from lmshealth._private.tables import TABLES
-from lmshealth.calibration.check import CalibrationCheck
+from lmshealth.calibration import page as pages
+from lmshealth.calibration.check import DAYS, DRAWN, CalibrationCheck
 from lmshealth.calibration.page import (
     Share,
     histogram_picture,
+    life_rows,
     rank_histogram,
     share_plot,
     verdict_of,
     write_results,
 )
-from tests.calibration.test_check import outcomes, summary
+from lmshealth.report.tables import csv_text
+from tests.calibration.test_check import HEALTH, outcomes, summary
 
 
 @pytest.fixture(scope="module")
@@ -102,3 +107,46 @@ def test_a_share_apart_from_what_is_stated_has_another_colour() -> None:
     ax = share_plot(Figure().add_subplot(), rows)
     points = [line.get_color() for line in ax.lines if line.get_marker() == "o"]
     assert points[0] == points[2] != points[1]
+
+
+def test_colours_are_those_of_the_verdict(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What the rule over all checks passes is not red, though its 95 % interval alone misses."""
+    shown: dict[str, Share] = {}
+
+    def record(title: str, rows: list[Share], caption: str, **_: Any) -> pages.Picture:
+        shown.update({one.label: one for one in rows})
+        return pages.Picture(title, "", caption)
+
+    monkeypatch.setattr(pages, "share_picture", record)
+    ends = [np.linspace(0.002, 0.048, 9), np.linspace(0.952, 0.998, 8)]
+    places = np.concatenate([*ends, np.linspace(0.055, 0.945, 83)]).tolist()
+    chance = [
+        msgspec.structs.replace(one, places={HEALTH: place})
+        for one, place in zip(outcomes(100, late=0.11), places, strict=True)
+    ]
+    write_results(tmp_path, found := summary(chance))
+    assert found.wrong == ()
+    held = shown[f"{DRAWN}, 90 %"], shown[f"{DRAWN}: limit reached before the service date"]
+    assert held[0].high < 0.9 and held[1].low > 0.05
+    assert not any(one.missed for one in held)
+    write_results(tmp_path, found := summary(outcomes(120, 0.5, late=0.3)))
+    assert "as described: limit reached before the service date" in found.wrong
+    assert shown[f"{DRAWN}, 90 %"].missed
+    assert shown[f"{DRAWN}: limit reached before the service date"].missed
+
+
+def test_what_is_beyond_the_horizon_is_an_empty_cell() -> None:
+    """As in prognosis.csv, of truth, quantiles and service; other numbers stay."""
+    (life,) = outcomes(1)
+    endless = msgspec.structs.replace(
+        life,
+        truth={HEALTH: 0.5, DAYS: np.inf},
+        places={HEALTH: 0.4, DAYS: 0.5},
+        quantiles={**life.quantiles, DAYS: (90.0, 95.0, np.inf, np.inf, np.inf)},
+        service="later",
+        wait=np.inf,
+    )
+    text = csv_text("calibration_lives", life_rows(summary([endless])))
+    health, days = text.splitlines()[1:]
+    assert health.endswith(f"{HEALTH},0.5,-1.0,-0.5,0.0,0.5,1.0,0.4,healthy,,later,,")
+    assert days.endswith(f"{DAYS},,90.0,95.0,,,,0.5,healthy,,later,,")

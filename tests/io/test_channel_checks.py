@@ -79,6 +79,18 @@ def test_independent_channels():
     assert independent([x, x + noise(0.1, seed=2), y], whole, 2) == [0, 2]
 
 
+def test_a_channel_at_rest_is_no_copy():
+    """What is constant for a while, or wherever it is compared, is none; copies of it are."""
+    x, y, whole = noise(1.0), np.round(noise(20.0, seed=1)), [(0, N)]
+    y[:5000] = 0.0
+    assert sorted(independent([x, y], whole, 2)) == [0, 1]
+    assert len(independent([y, 3 * y + 1, x], whole, 3)) == 2
+    short = np.full((2, N), 0.7)
+    short[0, 10_000:10_010], short[1, 20_100:20_110] = x[:10], y[-10:]
+    assert sorted(independent([*short, x], whole, 3)) == [0, 1, 2]
+    assert independent([*short], whole, 1) == [0]
+
+
 def test_missing_ranges():
     """NaN, infinite and absurd samples are counted; too many of them end the channel."""
     values = np.ones(1000)

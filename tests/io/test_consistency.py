@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import tracemalloc
 from collections.abc import Iterable
 
 import numpy as np
 import pytest
 
 from lmshealth.errors import BadLog
-from lmshealth.io import buffers, constants
+from lmshealth.io import buffers, consistency, constants
 from lmshealth.io.buffers import as_samples
 from lmshealth.io.consistency import Findings, compare
 from lmshealth.io.reading import read_log
@@ -202,6 +203,18 @@ def test_known_gaps_are_counted_once():
     assert seen.dropped.size == 0 and seen.notes == ()
 
 
+def test_many_known_gaps_need_little_memory():
+    """Jumps are compared with known gaps in memory that grows as their sum, not their product."""
+    position = without(constant()[0], range(50, 40_000, 100))
+    tracemalloc.start()
+    try:
+        seen = found(position, breaks=range(1, position.size))
+        peak = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    assert seen.notes == () and peak < 30e6
+
+
 # Repeated buffers
 
 
@@ -230,12 +243,12 @@ def test_a_repeated_buffer_is_left_out(kind, instead):
 def test_samples_that_all_channels_hold_are_left_out(value):
     """Zeros, or the last sample, in place of lost ones are found exactly, beside a repeat."""
     signals = np.stack([noise(20_000, 1), rounded(noise(20_000, 2), 0.02)])
-    for start in (0, 7000, 12_000):
+    for start in (4000, 7000, 12_000):
         signals[:, start : start + 300] = signals[:, start, None] if value is None else value
     signals[:, 15_000:15_512] = signals[:, 14_000:14_512]
     seen = compare(None, None, None, list(signals), RATE, NO_BREAKS)
     assert [note[0] for note in seen.notes] == ["repeated"]
-    want = [(0, 300), (7000, 7300), (12_000, 12_300), (15_000, 15_512)]
+    want = [(4000, 4300), (7000, 7300), (12_000, 12_300), (15_000, 15_512)]
     np.testing.assert_allclose(seen.repeated, want, atol=3)
     # One channel may be constant for a while, or all have a slower clock.
     alone = compare(None, None, None, [signals[0]], RATE, NO_BREAKS)
@@ -262,6 +275,38 @@ def test_a_machine_at_rest_with_coarse_channels_is_used(rest):
     signals = [rounded(slope * noise(20_000, seed), 0.05) for seed in (1, 2)]
     assert min((own[1:] == own[:-1]).mean() for own in signals) > 0.9 * rest
     assert compare(None, None, None, signals, RATE, NO_BREAKS).notes == ()
+
+
+@pytest.mark.parametrize("where", ["start", "end", "break", "gap"])
+def test_a_rest_at_an_end_of_a_piece_is_used(where):
+    """A seventh of the record in which coarse channels rest may be followed by any motion."""
+    signals = [rounded(noise(30_000, seed), 0.05) for seed in (1, 2)]
+    at = {"start": 0, "end": 25_800}.get(where, 10_000)
+    for own in signals:
+        own[at : at + 4200] = 0.0
+    if where == "gap":
+        signals[1][at - 40 : at] = np.nan
+    breaks = np.array([at + 4200] if where == "break" else NO_BREAKS, dtype=np.int64)
+    found_there = compare(None, None, None, signals, RATE, breaks)
+    assert found_there.notes == () and found_there.repeated.size == 0
+    signals[0][20_000:20_300] = signals[1][20_000:20_300] = 0.0
+    [(start, stop)] = compare(None, None, None, signals, RATE, breaks).repeated.tolist()
+    assert abs(start - 20_000) < 4 and abs(stop - 20_300) < 4
+
+
+@pytest.mark.parametrize("tail", [[0.0], [0.3], [0.0, 1.0], [0.0, 1.0, 3.0]])
+def test_constant_and_periodic_stretches_are_compared_once(tail, monkeypatch):
+    """A stretch whose samples are all selected is not compared anew for each of them."""
+    compared, extent = [], consistency._extent
+    monkeypatch.setattr(
+        consistency, "_extent", lambda *given: compared.append(given) or extent(*given)
+    )
+    # Whatever the hash of a value is.
+    monkeypatch.setattr(consistency, "_SELECTED", 1)
+    values = noise(20_000)
+    values[14_000:] = np.resize(tail, 6000)
+    assert compare(None, None, None, [values], RATE, NO_BREAKS).notes == ()
+    assert len(compared) <= len(tail)
 
 
 def test_one_channel_that_repeats_is_no_repeated_buffer():

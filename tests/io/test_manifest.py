@@ -6,7 +6,15 @@ from unicodedata import normalize
 import pytest
 
 from lmshealth.errors import BadLog, BadTable
-from lmshealth.io.manifest import MISSPELT, find_logs, name_of, read_manifest
+from lmshealth.io.manifest import (
+    MISSPELT,
+    find_logs,
+    name_of,
+    read_manifest,
+    read_rows,
+    to_moments,
+    to_numbers,
+)
 from lmshealth.io.reading import read_log
 
 HEADER = "file,stage,travel_km,baseline\n"
@@ -264,3 +272,17 @@ def test_no_folder(tmp_path):
     for verb in (find_logs, read_manifest):
         with pytest.raises(BadTable, match="no folder"):
             verb(tmp_path / "absent")
+
+
+@pytest.mark.parametrize(
+    "text", ["a,b\n1,2\n\n \n3,x\n", "\ufeff\na,b\n\n1,2,\n3,x,\n", "a,b\n\n,\n\n3,x"]
+)
+def test_lines_of_a_table_are_those_of_the_file(tmp_path, text):
+    """Blank lines above, below the names and between rows are counted, and hold no row."""
+    path = tmp_path / "table.csv"
+    path.write_text(text, encoding="utf-8")
+    with pytest.raises(BadTable, match="line 5: b is 'x'"):
+        to_numbers(path, read_rows(path, ()), ["b"])
+    path.write_text(text.replace("b", "recorded_at", 1).replace("2", "2026-01-05T08:00Z"), "utf-8")
+    with pytest.raises(BadTable, match="line 5: recorded_at is 'x'"):
+        to_moments(path, read_rows(path, ()))

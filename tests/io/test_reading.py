@@ -5,7 +5,7 @@ import hashlib
 import os
 import subprocess
 import sys
-from datetime import timedelta
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 import h5py
@@ -175,6 +175,14 @@ def test_overrides(make):
     assert log.name == "n"
 
 
+def test_overrides_are_numbers_too(make):
+    """Values that are no text are read as the text of them, and None overrides nothing."""
+    moment = datetime(2026, 2, 3, tzinfo=UTC)
+    given = {"travel_km": 3, "stage": None, "baseline": True, "recorded_at": moment}
+    own = read_log(make(), overrides=given).metadata
+    assert (own.travel, own.stage, own.baseline, own.recorded_at) == (3e3, "demo-Y", True, moment)
+
+
 def test_import_is_light():
     """Importing the readers brings none of the libraries that read the formats."""
     folder = str(Path(readers.__file__).parents[1])
@@ -283,6 +291,31 @@ def test_useless_set_point(make):
     log = read_log(make(columns={"reference_velocity_mm_s": np.full(400, np.nan)}))
     assert log.reference_velocity is None and log.pieces == ((0, 400),)
     assert log.refused[0].channel == "reference_velocity"
+
+
+@pytest.mark.parametrize("share", [0.2, 1.0])
+def test_a_set_position_replaces_a_useless_set_velocity(make, share):
+    """A velocity that lacks samples is refused; the position is used, and not compared with it."""
+    time = np.arange(400) / 2000
+    useless = np.where(np.arange(400) < 400 * share, np.nan, 100.0)
+    columns = {"reference_velocity_mm_s": useless, "reference_position_mm": 50 * time}
+    log = read_log(make(columns=columns))
+    assert [(one.channel, one.reason) for one in log.refused] == [
+        ("reference_velocity", "missing-samples")
+    ]
+    assert log.reference_velocity is not None
+    np.testing.assert_allclose(log.reference_velocity[:], 0.05)
+
+
+def test_a_log_that_begins_at_rest_is_used(make):
+    """Whole counts of an encoder that are equal for 4 s are no copy of another channel."""
+    counts = np.round(20 * np.random.default_rng(3).normal(size=12_000))
+    counts[:8400] = 0.0
+    path = make(columns={"delta_e_um": counts}, n=12_000)
+    log = read_log(path)
+    assert log.refused == () and len(log.channels) == 2
+    log = read_log(make(columns={"delta_e_um": counts, "acc_feed_m_s2": None}, n=12_000))
+    assert log.refused == () and [one.name for one in log.channels] == ["delta_e"]
 
 
 @pytest.mark.parametrize("n", [0, 1])

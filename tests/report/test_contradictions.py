@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator
 from dataclasses import replace
-from datetime import date, timedelta
+from datetime import date, datetime, timedelta, timezone
 from itertools import product
 from pathlib import Path
 
@@ -161,6 +161,23 @@ def test_a_machine_without_logs_for_long_is_unknown_everywhere(make: Maker, tmp_
     # A limit of one's own replaces that by the intervals of the logs.
     status = judge_on(make_status(made, summary), last + timedelta(days=176), 200.0)
     assert status.verdict == "healthy"
+
+
+def test_a_log_is_of_its_day_in_utc_everywhere(make: Maker, tmp_path: Path) -> None:
+    """Of a log at 1:00 east of Greenwich both pages state the day before, where its age begins."""
+    made = make()
+    last = datetime(2026, 10, 20, 1, tzinfo=timezone(timedelta(hours=2)))
+    found = replace(
+        made,
+        history=replace(made.history, recorded_at=(*made.history.recorded_at[:-1], last)),
+        judgement=replace(made.judgement, recorded_at=last),
+        today=last.date(),
+    )
+    first, _, row = pages_of(found, served(found, "by", 20.0), tmp_path)
+    assert "Written on 2026-10-20, last log 2026-10-19 23:00 UTC, no log for 1 day" in first
+    assert "State at the last log, 2026-10-19" in first
+    assert "Written on 2026-10-20, last log 2026-10-19, no log for 1 day" in row
+    assert row.count("last log 2026-10-19") == 2
 
 
 def test_the_page_of_a_loss_keeps_its_headline(make: Maker, tmp_path: Path) -> None:

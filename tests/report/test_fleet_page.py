@@ -57,6 +57,9 @@ def percent_of(text: str) -> int:
         (["A 1", "A/1", "a-1"], ["a-1.html", "A-1-2.html", "A-1-3.html"]),
         # Whose identity is a file name has that, also beside one that sorts before it.
         (["LMS 3", "LMS-3"], ["LMS-3.html", "LMS-3-2.html"]),
+        # What is numbered because of its case, or of the index, takes no name of another.
+        (["A", "a", "a-2"], ["A.html", "a-2.html", "a-3.html"]),
+        (["index", "index-2"], ["index-2.html", "index-3.html"]),
         (["index", "..", "", "Führung"], ["index-2.html", "stage-2.html", "stage.html"]),
         (["x" * 70, "x" * 80], ["x" * 60 + ".html", "x" * 60 + "-2.html"]),
     ],
@@ -65,7 +68,8 @@ def test_files_are_safe_and_never_twice_the_same(identities: list[str], files: l
     """Signs that no file system takes are gone, and the order of the stages plays no part."""
     names = file_names(identities)
     assert set(files) <= set(names.values())
-    assert all(names[one] == f"{one}.html" for one in ("M7-Y", "LMS-3", "a-1") if one in names)
+    own = {"M7-Y", "LMS-3", "a-1", "a-2", "index-2"} & names.keys()
+    assert all(names[one] == f"{one}.html" for one in own)
     assert len({name.casefold() for name in names.values()}) == len(identities)
     assert file_names(reversed(identities)) == names
     assert all(len(name) <= 70 and not set('/\\:*?"<>|') & set(name) for name in names.values())
@@ -124,6 +128,14 @@ def test_a_small_fleet_needs_no_script(tmp_path: Path) -> None:
     for n, there in ((10, False), (11, True)):
         page = Page(write_index(tmp_path, make_rows(n), ()))
         assert ("script" in page.tags, "input" in page.tags) == (there, there)
+
+
+def test_a_verdict_outside_the_map_is_counted_as_one_that_is_not_clear(tmp_path: Path) -> None:
+    """Neither the header nor the filter states that such a machine has no verdict."""
+    rows = [replace(row, verdict="outside-map", state="open") for row in make_rows(N)]
+    text = words(Page(write_index(tmp_path, rows, ())))
+    assert f"0 healthy, {N} without a clear verdict" in text
+    assert f"No clear verdict {N}" in text and "No verdict" not in text
 
 
 def test_thousands_of_refused_logs_stay_short(tmp_path: Path) -> None:

@@ -205,14 +205,28 @@ def test_an_undetermined_parameter_shows_no_number(make: Maker, tmp_path: Path) 
 @pytest.mark.usefixtures("blank")
 def test_a_page_without_results_gives_the_reasons(make: Maker, tmp_path: Path) -> None:
     """A page without track, health and prognosis gives the reason for each."""
-    text = words(one(tmp_path, nothing(make())))
+    bare = nothing(make())
+    text = words(one(tmp_path, replace(bare, history=replace(bare.history, baselines=(38,)))))
     assert "Not enough data for a verdict" in text
     assert "No log contains an estimate of a tracked mode" in text
-    assert "do not determine the health parameters yet" in text
+    assert "usable logs since the baseline began: 2, needed 5." in text
     assert "No remaining life without health parameters" in text
     assert not re.search(r"\bnan\b", text.lower())
     untracked = replace(make(), track=None)
     assert "could not be tracked" in words(one(tmp_path, untracked))
+
+
+@pytest.mark.usefixtures("blank")
+def test_the_number_of_logs_is_no_reason_where_it_suffices(make: Maker, tmp_path: Path) -> None:
+    """Of a parked machine the page has the notice of the step that failed, else of its verdict."""
+    logs = examples.readings()[:6]
+    parked = [replace(log, metadata=replace(log.metadata, travel=5e3)) for log in logs]
+    text = words(one(tmp_path / "parked", assess(parked, load_stage("lms-y"))))
+    part = text[text.index("Health at the last log") : text.index("Remaining life")]
+    assert "over 0 km; a life needs at least 3 logs and some travel" in part
+    without = one(tmp_path / "bare", nothing(make()))  # 40 logs, and no notice
+    assert words(without).count("2 logs so far; a baseline needs 5.") == 3
+    assert not re.search(r"since the baseline began: \d+, needed", text + words(without))
 
 
 @pytest.mark.usefixtures("blank")
@@ -478,8 +492,12 @@ def test_a_page_is_self_contained_and_well_formed(make: Maker, tmp_path: Path) -
 
 
 def test_a_life_by_the_time_has_no_odometer(make: Maker, tmp_path: Path) -> None:
-    """No heading, axis or description of a picture names one. Control: a machine that has it."""
-    known = make()
+    """No heading, axis or description of a picture names one. Control: a machine that has it.
+
+    The travel of its logs is that of its life, beside a service that is beyond the horizon.
+    """
+    known = make(wear_km=400000, floor=0.98)
+    assert known.service().kind == "later"
     unknown = np.full_like(known.history.travel, np.nan)
     assert known.track is not None
     history = replace(known.history, travel=unknown)
@@ -489,6 +507,7 @@ def test_a_life_by_the_time_has_no_odometer(make: Maker, tmp_path: Path) -> None
     assert "odometer" not in found.casefold()
     assert "days since the first log" in found and "travel in km" in found
     assert f"nan{GAP}km" not in found
+    assert f"The logs cover 1{GAP}600{GAP}km since the baseline." in found
 
 
 @pytest.mark.usefixtures("blank")

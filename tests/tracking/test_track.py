@@ -497,6 +497,22 @@ def test_a_first_log_that_is_far_off_is_an_outlier(stage: Stage, off: float, n: 
     assert all("logs after" in one.detail for one in outlier_refusals(history, found))
 
 
+@pytest.mark.parametrize("gaps", [(1.0, 30.0), (1.0, 7.0), (10.0, 1.0)])
+def test_steady_wear_is_followed_where_the_distance_between_logs_changes(
+    stage: Stage, monkeypatch: pytest.MonkeyPatch, gaps: tuple[float, float]
+) -> None:
+    """Logs without errors show the drift that there is, from a schedule to another one."""
+    travel = 1e5 + 2e4 * np.cumsum(np.repeat([0.0, *gaps], [1, 20, 12]))
+    drift = -0.03 * (travel - travel[0])[:, None] / np.ptp(travel)
+    history = make_history(np.log(FREQUENCY[:2]) + drift, travel=travel, std=3e-4)
+    off = []
+    for known in (constants.KNOWN_RATE_LOGS, 10**6):
+        monkeypatch.setattr(constants, "KNOWN_RATE_LOGS", known)
+        found = track(history, stage)
+        off.append(np.abs((found.drift - drift)[12:] / std_of(found)[12:]).max())
+    assert off[0] < 0.05 and off[1] > 0.2  # negative control: rates keep their number per life
+
+
 def test_first_logs_that_agree_or_wear_or_deviate_together_are_no_outliers(stage: Stage) -> None:
     """Negative control: neither an early wear nor a step after the second log leaves logs out."""
     rng = np.random.default_rng(32)

@@ -413,6 +413,11 @@ _LATEST, _UNIX_TIMES = 1e10, (1e9, 2.2e9)
 # Days since 1900 from 1954 to 2173, which spreadsheets write, and their largest step: in s it would
 # be a sample rate of 1 MHz.
 _DAYS, _DAY_STEP = (2e4, 1e5), 1e-6
+# Least sample rate in Hz of ticks in a coarser unit than the column states: a lower one shows no
+# modes, and the times are a large count in their own unit.
+_LEAST_TICK_RATE = 100.0
+# Dates in which the order of day, month and year is open; with points they begin with the day.
+_SHORT_DATE = r"^\s*(\d{1,2}[/-]\d{1,2}[/-](?:\d{4}|\d{2})(?!\d))"
 
 
 class SinceFirst:
@@ -424,25 +429,26 @@ class SinceFirst:
     def __init__(self, name: str, columns: ColumnMap) -> None:
         self._unit = columns.signal(columns.target(name) or "").factor
         self.first: np.datetime64 | None = None
-        self._dates: set[str] = set()  # with slashes, of which either number may be the day
+        self._dates: set[str] = set()  # of which either number may be the day
 
     def parse(self, text: Any) -> FloatArray:
         """Return the times of a series of text, ``(n,)``; what is no moment is no time.
 
-        `Unusable` (``time``) for several dates like 05/01/2026, of which none shows their order.
+        `Unusable` (``time``) for several dates like 05/01/2026 or 26-01-05, of which none shows
+        their order.
         """
         import pandas as pd
 
         words = text.astype(str)
-        slashed = words.str.extract(r"^\s*(\d{1,2}/\d{1,2}/\d{4})", expand=False).dropna().unique()
+        short = words.str.extract(_SHORT_DATE, expand=False).dropna().unique()
         before = bool(_day_first(self._dates)) if self._dates else None
-        self._dates = self._dates.union(slashed)
+        self._dates = self._dates.union(short)
         day_first = _day_first(self._dates)
         # A single date of either order gives the same times: it is read with the month first.
         is_open = day_first is None or before not in (None, day_first)
         if len(self._dates) > 1 and is_open:
             found = " and ".join(sorted(self._dates)[:2])
-            detail = f"dates like {found} may begin with the day or with the month"
+            detail = f"dates like {found} may begin with the day or not"
             raise Unusable("time", f"{detail}; write them as YYYY-MM-DD")
         dotted = bool(words.str.match(r"\d{1,2}\.").any())
         text = words.str.replace(",", ".") if text.dtype == object else text
@@ -462,34 +468,60 @@ class SinceFirst:
 
 
 def _day_first(dates: Iterable[str]) -> bool | None:
-    """Return whether dates with slashes begin with the day; None where none shows it."""
-    pairs = [tuple(map(int, date.split("/")[:2])) for date in dates]
-    if any(first > 12 for first, _ in pairs):
+    """Return whether short dates begin with the day; None where none shows it."""
+    parts = [re.split("[/-]", date) for date in dates]
+    # The first number of a date like 26-01-05 may be its year.
+    if any(int(first) > 12 and len(year) == 4 for first, _, year in parts):
         return True
-    return False if any(second > 12 for _, second in pairs) else None
+    return False if any(int(second) > 12 for _, second, _ in parts) else None
 
 
 def without_epoch(content: Content, columns: ColumnMap) -> Content:
     """Convert ticks or days since an epoch in columns of times to times since the first.
 
-    Other times stay as they are.
+    Other times stay as they are. `Unusable` (``time``) for times in a fine unit that may be ticks
+    in a coarser one, where no sample rate is stated that only one of both readings gives.
     """
+    has_rate = columns.sample_rate_hz is not None or "sample_rate_hz" in content.metadata
     for name, samples in content.columns.items():
         if columns.is_time(name) and samples.size:
-            with suppress(Unusable):  # a unit that is not stated is refused with the others
+            try:
                 unit = columns.signal(columns.target(name) or "").factor
-                content.columns[name], guessed, moment = _since_first(samples, unit)
-                metadata, guessed = moment | content.metadata, (*content.guessed, *guessed)
-                content = replace(content, metadata=metadata, guessed=guessed)
+            except Unusable:
+                continue  # a unit that is not stated is refused with the others
+            if not has_rate:
+                _check_no_ticks(name, samples, unit)
+            content.columns[name], guessed, moment = _since_first(samples, unit)
+            metadata, guessed = moment | content.metadata, (*content.guessed, *guessed)
+            content = replace(content, metadata=metadata, guessed=guessed)
     return content
+
+
+def _check_no_ticks(name: str, time: Samples, unit: float) -> None:
+    """Refuse times in a unit in s that are also ticks of today, at the rate of a vibration."""
+    start, step = _start_and_step(time)
+    ticks = next((one[1:] for one in _TICKS if abs(start) >= one[0]), None)
+    if ticks is None or start * unit >= _UNIX_TIMES[0] or not step > 0:
+        return
+    scale, what, epoch = ticks
+    is_today = _UNIX_TIMES[0] <= start / scale + epoch < _UNIX_TIMES[1]
+    if is_today and scale / step >= _LEAST_TICK_RATE:
+        found = f"{1 / (step * unit):.6g} Hz, or {scale / step:.6g} Hz as times in {what}"
+        cure = "map it to time_s for the second, state sample_rate_hz for the first"
+        raise Unusable("time", f"{name} gives {found} {SINCE_EPOCH}; {cure}")
+
+
+def _start_and_step(time: Samples) -> tuple[float, float]:
+    """Return the first time and the mean step of the first block."""
+    first = next((block for _, block in blocks(time)), np.zeros(1))
+    return float(first[0]), float(np.ptp(first)) / max(first.size - 1, 1)
 
 
 def _since_first(time: Samples, unit: float) -> tuple[Samples, tuple[str, ...], dict[str, str]]:
     """Convert ticks or days since an epoch to times since the first, in a unit in s."""
     # Other times stay as they are. Return what was taken for what, and the moment of the
     # first ticks.
-    first = next((block for _, block in blocks(time)), np.zeros(1))
-    start, step = float(first[0]), float(np.ptp(first)) / max(first.size - 1, 1)
+    start, step = _start_and_step(time)
     ticks = (one[1:] for one in _TICKS if abs(start) >= one[0] and abs(start) * unit > _LATEST)
     if _DAYS[0] <= start < _DAYS[1] and step < _DAY_STEP:
         scale, what, epoch = 1 / 86400, "days", None

@@ -237,6 +237,7 @@ def parse_text(stream: Any, columns: ColumnMap) -> Content:
     What is wrong is refused as ``empty``, ``corrupt``, ``metadata``, ``format`` or ``columns``.
     """
     encoding = columns.csv.encoding or encoding_of(stream.read(_HEAD_BYTES))
+    encoding = codecs.lookup(encoding).name  # of several spellings
     guessed = [f"{encoding} text"] if encoding != "utf-8" else []
     if encoding.startswith("utf-16"):
         stream, encoding = codecs.EncodedFile(stream, "utf-8", encoding), "utf-8"
@@ -326,6 +327,8 @@ def _spooled(
     tables: Iterable[Any], places: dict[str, int], times: Mapping[str, SinceFirst]
 ) -> dict[str, Samples]:
     """Collect the columns of tables, block by block; empty rows at the end are left out."""
+    import pandas as pd
+
     taken = {name: Spool() for name in places}
     n_rows = n_blank = 0
     for table in tables:
@@ -337,6 +340,12 @@ def _spooled(
             is_number = values.dtype.kind in "fiu"
             if not is_number and name not in times:
                 raise not_numeric(name, _first_text(values.tolist(), n_rows))
+            if not is_number:
+                words = values.astype(str).str.replace(",", ".")
+                # A few other texts do not make moments of numbers.
+                n_numbers = pd.to_numeric(words, errors="coerce").notna().sum()
+                if n_numbers > values.notna().sum() / 2:
+                    raise not_numeric(name, _first_text(words.tolist(), n_rows))
             numbers = values.to_numpy() if is_number else times[name].parse(values)
             if n_used:
                 taken[name].append(np.full(n_blank, np.nan))

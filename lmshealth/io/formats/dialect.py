@@ -112,6 +112,10 @@ def find_dialect(lines: Sequence[str], columns: ColumnMap) -> Dialect:
         delimiter, decimal = layout.delimiter or ",", layout.decimal or "."
         n_fields = len(fields_of(lines[begin], delimiter))
         found = _Rows(0.0, False, 0, begin + 1, n_fields, delimiter, decimal)
+    if found.share:
+        found = found._replace(first=_first_like(lines, skip, found))
+    # A spreadsheet fills leading lines up to the number of columns.
+    metadata = {key: value.rstrip(f"{found.delimiter} ") for key, value in metadata.items()}
     above = lines[skip : found.first]
     if layout.delimiter is None and layout.decimal is None:
         _check_thousands(lines[found.first :], found.delimiter)
@@ -187,7 +191,7 @@ def _leading(lines: Sequence[str], skip: int) -> tuple[dict[str, str], int]:
     """Read the leading lines ``# key: value``, and return the line at which they end."""
     metadata: dict[str, str] = {}
     for k, line in enumerate(lines[skip:], skip):
-        if line.strip() and not line.startswith("#"):
+        if line.strip().strip(_DELIMITERS) and not line.startswith("#"):
             return metadata, k
         key, colon, value = (part.strip() for part in line.lstrip("# \t").partition(":"))
         if colon and metadata.setdefault(key, value) != value and key in metadata_keys():
@@ -225,6 +229,27 @@ def _first_row(split: Sequence[tuple[int, list[str]]], number: re.Pattern[str]) 
     rows = [k for k, size in sizes.items() if size == most]
     usual = median(shares[k] for k in rows) if rows else 0.0
     return next((k for k in rows if shares[k] > usual / 2), None)
+
+
+def _first_like(lines: Sequence[str], skip: int, found: _Rows) -> int:
+    """Find the first row below the names: its texts may be longer than those of later rows."""
+
+    def kinds(line: str) -> list[bool | None]:
+        """Return which fields are numbers or moments; None for an empty one."""
+        words = [one.strip(" \t\r\n-") for one in fields_of(line, found.delimiter)]
+        return [is_number_or_moment(word) if word else None for word in words]
+
+    usual, first = kinds(lines[found.first]), found.first
+    for k in range(found.first - 1, skip - 1, -1):
+        own = kinds(lines[k])
+        if lines[k].startswith("#") or (False in own and True not in own):
+            break
+        # A line of a header may begin with a key where rows have a number or nothing.
+        if len(own) != len(usual) or own[0] != usual[0] or True not in own:
+            continue
+        if not any(there and one is False for one, there in zip(own, usual, strict=True)):
+            first = k
+    return first
 
 
 def _share(fields: Sequence[str], number: re.Pattern[str]) -> float:

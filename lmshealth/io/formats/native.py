@@ -143,6 +143,8 @@ def _attribute(file: Any, key: str) -> str:
     import h5py
 
     attribute = file.attrs.get_id(key)
+    if attribute.get_space().get_simple_extent_type() == h5py.h5s.NULL:
+        return ""
     # Its type is checked before it is read: the library crashes on damaged types of other classes.
     plain = h5py.h5t.TypeStringID, h5py.h5t.TypeIntegerID, h5py.h5t.TypeFloatID, h5py.h5t.TypeEnumID
     kind = attribute.get_type()

@@ -33,7 +33,6 @@ _N_EXAMPLES, _RESIDUAL = 300, 1e-4
 # Distance in ln f of the last drift of a life from that of the logs from which it counts less.
 _NEAR = 0.003
 _AT_A_TIME = 20_000  # moments of lives of the prior whose drifts are computed at a time
-_ROUNDING = 1e-14  # share of the largest eigenvalue below which one is rounding
 # Whitened drifts that are computed at a time: larger arrays are returned to the system and fetched
 # anew by each operation, which takes as long as the operation.
 _CACHED = 500_000
@@ -230,11 +229,8 @@ class Grid(Rows):
     def of(cls, data: LifeData, covariance: LifeCovariance, basis: NodeBasis) -> Self:
         """Whiten data at all points of the grid."""
         points, prior = [], scatter_prior(data.stage)
-        # Intercepts and coefficients are few: a root of their covariance has few columns.
-        size, vectors = np.linalg.eigh(covariance.fixed)
-        some = size > _ROUNDING * size[-1]
-        root = vectors[:, some] * np.sqrt(size[some])
         n_modes, alone = len(data.modes), data.stage.description.life.lone_mode
+        intercepts = constants.INTERCEPT_STD * np.equal.outer(data.mode_of, np.arange(n_modes))
         # A mode that moves alone needs others that do not.
         alone *= n_modes > 1
         common = data.stage.description.life.common_wander * (n_modes > 1)
@@ -261,9 +257,10 @@ class Grid(Rows):
             log_weight = np.log(wrong * p * q * r) - np.sum(np.log(np.diag(factor)))
             design = basis_r.T.reshape(n_modes, -1, target.size)
             rest = np.sum(u**2) - np.sum(target**2)
-            # The trace of Σ⁻¹ times the fixed part.
-            fixed = np.sum(solve_triangular(factor, root, lower=True) ** 2)
-            values = (design, target, rest, log_weight, data.y.size - fixed)
+            # The trace of Σ⁻¹ times the part of the intercepts. What else is fixed is as large as
+            # its prior, which is in χ²: it takes no degree of freedom.
+            determined = np.sum(solve_triangular(factor, intercepts, lower=True) ** 2)
+            values = (design, target, rest, log_weight, data.y.size - determined)
             points.append((walk, scale, deviation, lone, std, error, *values))
         return cls(*(np.array(column) for column in zip(*points, strict=True)))
 
@@ -577,7 +574,8 @@ class LifeDensity:
         """Return means at coordinates of walk, noise scale, deviation, χ², and its freedom.
 
         χ² is that at the mean of the coordinates. Its degrees of freedom are the data less all that
-        they determine: intercepts, coefficients, and coordinates.
+        they determine: intercepts, and coordinates as far as χ² is larger at the draws than at
+        their mean [Spiegelhalter2002].
         """
         weight, grid = self.point_weights(y).mean(axis=2), self.grid
         centre = y.mean(axis=0, keepdims=True)
@@ -585,10 +583,13 @@ class LifeDensity:
         x, inside = self.likelihood.path(self.scenario, centre[possible])
         if not inside.any():
             x, _ = self.likelihood.path(self.scenario, y[:1])
-        chi_square = float(np.sum(weight * self.likelihood.quadratic(grid, x)[0][:, :, 0]))
+        drawn, _ = self.likelihood.path(self.scenario, y[np.isfinite(self.scenario.log_prior(y))])
+        both = self.likelihood.quadratic(grid, np.concatenate([x[:1], drawn]))[0]
+        chi_square, *at_draws = np.tensordot(weight, both, 2).tolist()
+        informed = np.clip(np.mean(at_draws) - chi_square, 0.0, self.scenario.n_dim)
         means = np.stack([grid.walk, grid.noise_scale, grid.deviation, grid.freedom])
         walk, noise, deviation, freedom = means @ weight.sum(axis=0)
-        freedom = max(freedom - self.scenario.n_dim, 1.0)
+        freedom = max(freedom - informed, 1.0)
         return np.array([walk, noise, deviation, chi_square, freedom])
 
     def draw_nuisances(

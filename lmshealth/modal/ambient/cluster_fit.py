@@ -622,7 +622,8 @@ def _averaged(
         ln_f, ln_zeta = np.split(mean, 2)
         return replace(modes.widened("coloured", cov), ln_frequency=ln_f, ln_damping=ln_zeta)
 
-    cov = colour.cov * np.outer(wider, wider)
+    # An unsteady force makes the noise larger, not what its spectrum leaves open.
+    cov = colour.cov * np.outer(wider, wider) + colour.more
     averaged = with_mean(colour.mean, cov)
     # Which modes are found does not depend on the average: where it is not credible the estimate
     # for a white force remains, and covers both.

@@ -99,7 +99,8 @@ class Colour(NamedTuple):
     """Posterior of ``[ln f, ln ζ]`` averaged over white and coloured forces."""
 
     mean: FloatArray
-    cov: FloatArray
+    cov: FloatArray  # for a white force
+    more: FloatArray  # what coloured forces add to it
     probability: float  # of a coloured force
 
 
@@ -122,7 +123,7 @@ def average_colours(
     coloured = likelihood.coloured(bumps, constants.WIDTHS_COLOUR[0])
     guess = marginalise(coloured, q)
     if np.isfinite(guess.decrement) and guess.log_evidence - flat.log_evidence < _UNLIKELY:
-        return Colour(white.mean, white.cov, 0.0)
+        return Colour(white.mean, white.cov, np.zeros_like(white.cov), 0.0)
     found = [flat]
     for std in constants.WIDTHS_COLOUR:
         coloured = coloured.with_bump_std(std)
@@ -134,13 +135,16 @@ def average_colours(
             if one.log_evidence - flat.log_evidence < _UNLIKELY:
                 break
     if len(found) == 1:
-        return Colour(white.mean, white.cov, 1.0)
+        return Colour(white.mean, white.cov, np.zeros_like(white.cov), 1.0)
     weight = softmax([one.log_evidence for one in found])
     mean = weight @ [one.mean for one in found]
     apart = np.array([one.mean for one in found]) - mean
     cov = np.tensordot(weight, [one.cov for one in found], axes=1)
-    cov = cov + (weight[:, None] * apart).T @ apart
-    return Colour(white.mean + mean - flat.mean, cov / ratio, 1.0 - float(weight[0]))
+    more = cov + (weight[:, None] * apart).T @ apart - flat.cov
+    if ratio > 1:  # beside fewer ordinates than there are it may be negative in a direction
+        size, vectors = np.linalg.eigh(more)
+        more = (vectors * np.maximum(size, 0.0)) @ vectors.T
+    return Colour(white.mean + mean - flat.mean, white.cov, more, 1.0 - float(weight[0]))
 
 
 def _of_same_modes(coloured: Marginal, white: Marginal) -> Marginal:

@@ -139,7 +139,9 @@ def predict(space: StateSpace, bank: FilterBank, k: int) -> FilterBank:
         keep = own.wander_keep[:, None, None]
         state[:, wander] *= keep
         state[:, :, wander] *= keep
-        # A level moves by this part of a life times its rate.
+        # A level moves by this part of a life times its rate, which is per life of now.
+        state[:, rate] *= space.longer[k]
+        state[:, :, rate] *= space.longer[k]
         moved = space.ticks[k]
         if own.decays:
             decay = own.rate_decay[:, None, None]
@@ -182,7 +184,7 @@ def update(
     crossed[:, -1] -= given.values
     total = matrix @ crossed[:, :-1] + errors
     if given.extra is not None:
-        diagonal(total)[:] += given.extra
+        total += given.extra
     centre, cov = mixture(bank.weight, -crossed[:, -1], total)
     standardised = centre / np.sqrt(cov.diagonal())
     updated, outlying = _condition(bank, crossed, total), np.zeros(rows.size)
@@ -453,7 +455,7 @@ def _errors(given: Observation, own: Nuisances) -> FloatArray:
     """Return the covariance of the errors of the estimates of one log."""
     scale = own.scales[given.source] / np.sqrt(own.weight[given.rows])
     errors: FloatArray = given.cov * (scale[:, None] * scale)
-    return errors if given.extra is None else errors + np.diag(given.extra)
+    return errors if given.extra is None else errors + given.extra
 
 
 def _transition(space: StateSpace, own: Nuisances, k: int) -> tuple[FloatArray, FloatArray]:
@@ -463,7 +465,8 @@ def _transition(space: StateSpace, own: Nuisances, k: int) -> tuple[FloatArray, 
     if k == 0:
         noise[space.wander, space.wander] = own.wander * space.wander_cov
     elif space.seen[k]:
-        move[space.level, space.rate] = space.ticks[k] * np.eye(space.n_modes)
+        rates = space.longer[k] * np.eye(space.n_modes)
+        move[space.rate, space.rate], move[space.level, space.rate] = rates, space.ticks[k] * rates
         move[space.wander, space.wander] *= own.wander_keep
         walk, fresh = own.rate_walk, (1 - own.wander_keep**2) * own.wander
         parts = (own.level_walk, own.settling, walk, walk, walk, fresh, constants.DAMPING_WALK**2)

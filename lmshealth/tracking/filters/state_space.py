@@ -118,7 +118,7 @@ class Observation:
     values: FloatArray  # ``(n_rows,)``
     cov: FloatArray  # covariance of the errors as stated, ``(n_rows, n_rows)``
     source: np.ndarray  # index of the source of each, ``(n_rows,)``
-    extra: FloatArray | None  # variances of unknown covariates, ``(n_rows,)``; None without any
+    extra: FloatArray | None  # covariance of unknown covariates, as `cov`; None without any
 
 
 class StateSpace:
@@ -126,9 +126,10 @@ class StateSpace:
 
     Rates and random walks are per life of `constants.LOGS_PER_LIFE` logs at their mean distance so
     far. `ticks` are the parts of it between each log that has estimates (`seen`) and the one
-    before, and `settling` the parts of the variance of settling, ``(n_logs,)`` each; `size` is the
-    length of the state. `fixed` has the measurement matrices without steps, `observations` the
-    estimates of each log; `sources` are those of the series, `mode_of` is the index of the mode of
+    before, `longer` the length of a life over that at the log before, by which rates grow, and
+    `settling` the parts of the variance of settling, ``(n_logs,)`` each; `size` is the length of
+    the state. `fixed` has the measurement matrices without steps, `observations` the estimates of
+    each log; `sources` are those of the series, `mode_of` is the index of the mode of
     each row of ``[ln f, ln ζ]``, ``(2 n_series,)``, and `grid` has the hyperparameters that a
     filter bank starts with.
     """
@@ -153,8 +154,14 @@ class StateSpace:
         self.seen[:1] = True
         clock = np.where(self.seen, history.clock() - history.clock()[:1], 0.0)
         clock = np.maximum.accumulate(clock)
-        logs = (np.cumsum(self.seen) - 1) / np.where(clock > 0, clock, 1.0)
+        logs_so_far = np.cumsum(self.seen) - 1
+        logs = logs_so_far / np.where(clock > 0, clock, 1.0)
         self.ticks = np.diff(clock, prepend=0.0) * logs / constants.LOGS_PER_LIFE
+        # Until then rates are known little better than by their prior, which is per life of now.
+        mean, known = clock / np.maximum(logs_so_far, 1), logs_so_far >= constants.KNOWN_RATE_LOGS
+        known = known[:-1] & (mean[:-1] > 0)
+        self.longer = np.ones(mean.size)
+        self.longer[1:][known] = (mean[1:] / np.where(known, mean[:-1], 1.0))[known]
         since = np.cumsum(self.ticks) * constants.LOGS_PER_LIFE / constants.SETTLING_LOGS
         for first in history.baselines:  # a machine settles anew after work on it
             since[first:] -= since[first]
@@ -191,7 +198,7 @@ class StateSpace:
         """Return the state space without some estimates of log k, ``(2 n_series,)``."""
         other, given = copy(self), self._observations()[k]
         kept = np.flatnonzero(~outlying[given.rows])
-        extra = None if given.extra is None else given.extra[kept]
+        extra = None if given.extra is None else given.extra[kept[:, None], kept]
         own = given.rows[kept], given.values[kept], given.cov[kept[:, None], kept]
         left = Observation(*own, given.source[kept], extra)
         other.observations = [*self.observations[:k], left, *self.observations[k + 1 :]]
@@ -203,6 +210,7 @@ class StateSpace:
         # Their distances are all known: a gap before the first log is as long as it was.
         ticks = np.diff(other.history.clock(), prepend=0.0)
         other.ticks = ticks * (last - first) / (max(ticks.sum(), 1e-300) * constants.LOGS_PER_LIFE)
+        other.longer = np.ones(ticks.size)
         other.noise, other.noise_shares = other._process_noise()
         return other
 
@@ -276,12 +284,14 @@ class StateSpace:
         history, r = self.history, len(self.history.series)
         values = np.hstack([history.ln_frequency, history.ln_damping])
         source = np.array([self.sources.index(one.source) for one in history.series] * 2)
-        # Variance of ln f due to unknown covariates.
+        # Variance of ln f due to unknown covariates, which all series of a mode have in common.
+        alike = np.equal.outer(self.mode_of, self.mode_of)
+        alike[r:], alike[:, r:] = False, False
         unknown = sum((one.unknown for one in self.regressed), np.zeros(len(values)))
         found = []
         for own, cov, more in zip(values, history.cov, unknown, strict=True):
             rows = np.flatnonzero(np.isfinite(own))
-            extra = np.where(rows < r, more, 0.0) if more else None
+            extra = more * alike[rows[:, None], rows] if more else None
             errors = cov[rows[:, None], rows]
             found.append(Observation(rows, own[rows], errors, source[rows], extra))
         return found

@@ -86,7 +86,9 @@ def as_if_plain(log: Log, stage: Stage) -> Modes:
         patch.object(constants, "QUADRATURE_SIGMAS", (np.inf, np.inf)),
         patch.object(cluster_fit, "unsteadiness", lambda *_: Unsteadiness(1.0, 0)),
         patch.object(
-            cluster_fit, "average_colours", lambda _, p, white, *__: Colour(white[0], white[1], 0.0)
+            cluster_fit,
+            "average_colours",
+            lambda _, p, white, *__: Colour(white.mean, white.cov, 0 * white.cov, 0.0),
         ),
     ):
         return identify(log, stage)

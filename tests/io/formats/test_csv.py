@@ -295,16 +295,89 @@ def test_dates_of_two_readings_are_refused_where_it_matters():
     """A single date gives the same times either way; two do, unless a day above 12 shows which."""
 
     def times(*dates):
-        rows = "".join(f"{date} 23:59:{k:02d},1\n" for date in dates for k in range(30))
+        rows = "".join(
+            f"{date} 23:59:{k:02d},-0.123456789012\n" for date in dates for k in range(30)
+        )
         return parse("time_s,delta_e_um\n" + rows).columns["time_s"][:]
 
     np.testing.assert_allclose(times("05/01/2026"), np.arange(30), atol=1e-9)
     assert times("12/01/2026", "13/01/2026")[30] == times("12/31/2026", "01/01/2027")[30] == 86400
-    with pytest.raises(Unusable, match="05/01/2026 and 06/01/2026 may begin with the day"):
-        times("05/01/2026", "06/01/2026")
+    for dates in (
+        ("05/01/2026", "06/01/2026"),
+        ("05-01-2026", "06-01-2026"),
+        ("05/01/26", "06/01/26"),
+        ("26-01-05", "26-01-06"),
+    ):
+        np.testing.assert_allclose(times(dates[0]), np.arange(30), atol=1e-9)
+        with pytest.raises(Unusable, match=f"{' and '.join(dates)} may begin with the day"):
+            times(*dates)
+    for dates in (
+        ("12-01-2026", "13-01-2026"),
+        ("12/30/26", "12/31/26"),
+        ("05.01.26", "06.01.26"),
+        ("2026-01-05", "2026-01-06"),
+    ):
+        assert times(*dates)[30] == 86400
 
 
 def test_other_keys_may_be_given_again():
     """Two lines of a key that no metadata has, as of two sensors, refuse nothing."""
     raw = parse("# sensor: A\n# sensor: B\n# stage: C\ndelta_e_um\n1\n2\n")
     assert raw.metadata["stage"] == "C" and raw.columns["delta_e_um"].size == 2
+
+
+LONG = "jogging to the start position"
+
+
+@pytest.mark.parametrize(
+    ("names", "row", "later"),
+    [
+        ("time_ms,acc_x_m_s2,state", "{k},{a},{text}", "A"),
+        ("time_ms,acc_x_m_s2,event", "{k},{a},{text}", ""),
+        ("state,time_ms,acc_x_m_s2", "{text},{k},{a}", "A"),
+        ("time_s,acc_x_m_s2,state", "{k}.25,{a},{text}", "A"),
+        ("time_s,acc_x,state\ns,m/s²,-", "{k}.25,{a},{text}", "A"),
+    ],
+)
+@pytest.mark.parametrize("n_long", [2, 30])
+def test_rows_with_a_long_text_are_rows(names, row, later, n_long):
+    """Rows begin below the names, also where a text in the first ones is longer than numbers."""
+    rows = [row.format(k=k, a=k % 7 / 8, text=LONG if k < n_long else later) for k in range(60)]
+    raw = parse("\n".join([names, *rows, ""]))
+    assert {samples.size for samples in raw.columns.values()} == {60} and len(raw.columns) == 2
+    assert raw.guessed == ()
+    rows[n_long // 2] = rows[n_long // 2].replace(f"{n_long // 2 % 7 / 8}", "err")
+    with pytest.raises(Unusable, match=f"'err' in row {n_long // 2 + 1}"):
+        parse("\n".join([names, *rows, ""]))
+
+
+def test_numbered_channels_are_no_row():
+    """A line of numbers that begins with a key belongs to the header, however short the texts."""
+    head = "Kanalname\tdelta_e_um\tb\nKanalnummer\t1\t2\n"
+    raw = parse(head + "".join(f"\t{k % 7 / 8}\t{k}\n" for k in range(9)))
+    assert raw.columns["delta_e_um"].size == 9
+
+
+@pytest.mark.parametrize("name", ["UTF-16", "utf_16", "utf16", "U16", "utf-16"])
+def test_an_encoding_has_several_spellings(name):
+    """Every name that Python has for UTF-16 is one."""
+    raw = parse("stage\ndelta_e_um\n1\n2\n".encode("utf-16"), encoding=name)
+    assert raw.columns["delta_e_um"].tolist() == [1.0, 2.0]
+
+
+@pytest.mark.parametrize("mark", [".", ","])
+def test_a_text_among_times_is_quoted_with_its_row(small_blocks, mark):
+    """One text in a column of numbers makes no moments of the others."""
+    rows = [f"{k / 8};{k}".replace(".", mark) for k in range(40)]
+    rows[25] = "err;25"
+    with pytest.raises(Unusable, match="column 'time_s' holds 'err' in row 26"):
+        parse("\n".join(["time_s;delta_e_um", *rows, ""]))
+
+
+@pytest.mark.parametrize("mark", [",", ";", "\t"])
+def test_delimiters_that_fill_leading_lines_are_no_text(mark):
+    """A spreadsheet saves leading and blank lines with as many delimiters as the rows have."""
+    lines = ["# stage: AX-3-Y", "", "# servo_id: k 7", "delta_e_um,a,b", "1,2,3", "2,3,4", ""]
+    padded = (line + ",," * (line.startswith("#") or k == 1) for k, line in enumerate(lines))
+    raw = parse("\n".join(padded).replace(",", mark))
+    assert raw.metadata == {"stage": "AX-3-Y", "servo_id": "k 7"}

@@ -111,6 +111,40 @@ def test_times_since_an_epoch_in_a_column_of_any_unit(
     assert moment is None or abs(moment.timestamp() - START) < 1e-3
 
 
+@pytest.mark.parametrize(
+    ("name", "ticks", "epoch", "found"),
+    [
+        ("time_us", 1e3, 0, "500000 Hz, or 500 Hz as times in ms since"),
+        ("time_ns", 1e3, 0, r"5e\+08 Hz, or 500 Hz as times in ms since"),
+        ("time_ns", 1e6, 0, "500000 Hz, or 500 Hz as times in µs since"),
+        ("time_ns", 1e7, 11644473600, "50000 Hz, or 500 Hz as times in 100 ns since"),
+    ],
+)
+def test_ticks_in_a_column_of_a_finer_unit_are_not_guessed(
+    tmp_path: Path, name: str, ticks: float, epoch: int, found: str
+) -> None:
+    """Both rates are quoted; a map or the sample rate decides, and a slow count is in its unit."""
+    path = tmp_path / "a.csv"
+
+    def written(scale: float, head: str = "") -> Path:
+        start = round((START + epoch) * ticks)
+        rows = [f"{start + round(scale * t)},{a}" for t, a in zip(TIME.tolist(), A, strict=True)]
+        path.write_text(f"{head}{name},acc_x_g\n" + "\n".join([*rows, ""]))
+        return path
+
+    with pytest.raises(BadLog, match=f"{name} gives {found} an epoch; map it to time_s"):
+        read_log(written(ticks))
+    log = read_log(path, columns=ColumnMap(columns={"time_s": name}))
+    moment = log.metadata.recorded_at
+    assert log.sample_rate == pytest.approx(RATE, rel=1e-4)
+    assert moment is not None and abs(moment.timestamp() - START) < 1e-3
+    unit = {"time_us": 1e6, "time_ns": 1e9}[name]
+    log = read_log(written(ticks, f"# sample_rate_hz: {RATE * unit / ticks}\n"))
+    assert log.sample_rate == RATE * unit / ticks and log.metadata.recorded_at is None
+    log = read_log(written(unit))
+    assert log.sample_rate == pytest.approx(RATE, rel=1e-4) and log.metadata.recorded_at is None
+
+
 def test_more_names_than_fields_are_refused(tmp_path: Path) -> None:
     """A field of the names that the rows lack shifts all others: none is read by a wrong name."""
     path = tmp_path / "a.csv"

@@ -185,7 +185,7 @@ def test_hdf5_damaged_heap(make, monkeypatch):
 
 
 def test_hdf5_attributes(make):
-    """Attributes may be text, bytes, numbers or booleans; anything else is refused unread."""
+    """Attributes may be text, bytes, numbers, booleans or empty; others are refused unread."""
     path = make("log.h5")
     with h5py.File(path, "a") as file:
         file.attrs["travel_km"] = np.float32(1.5)
@@ -195,6 +195,11 @@ def test_hdf5_attributes(make):
     metadata = read_log(path).metadata
     assert (metadata.travel, metadata.stage) == (1500.0, "demo")
     assert (metadata.servo_id, metadata.baseline) == ("3", True)
+    with h5py.File(path, "a") as file:
+        file.attrs["servo_id"] = h5py.Empty("S1")
+        file.attrs["travel_km"] = h5py.Empty("f8")
+    metadata = read_log(path).metadata
+    assert (metadata.servo_id, metadata.travel) == (None, None)
     for value in ([1, 2], np.array([[1, 2]], dtype=object)[0, :0]):
         with h5py.File(path, "a") as file:
             file.attrs.create("servo_id", value, dtype="i8")

@@ -10,6 +10,7 @@ from typing import Literal
 
 import numpy as np
 import pytest
+from scipy import stats
 
 from lmshealth._private.arrays import FloatArray
 from lmshealth.errors import NotEnoughData
@@ -537,9 +538,9 @@ def test_settings_lie_inside_their_grids(poor_map: Stage) -> None:
     assert 1 <= scale <= constants.NOISE_SCALES[-1]
     assert constants.DEVIATION_STDS[0] <= deviation <= constants.DEVIATION_STDS[-1]
     assert chi_square > 0
-    # The logs determine two intercepts, and of two coefficients a part.
-    left = density.likelihood.data.y.size - density.scenario.n_dim
-    assert left - 6 < freedom < left - 2
+    # The logs determine two intercepts, and of the coordinates a part.
+    left = density.likelihood.data.y.size - 2
+    assert left - density.scenario.n_dim - 0.01 < freedom < left + 0.01
 
 
 def test_settings_of_draws_are_the_mean_of_each(poor_map: Stage) -> None:
@@ -562,9 +563,38 @@ def test_chi_square_of_a_life_as_stated_is_near_its_degrees_of_freedom(tmp_path:
     for factor, scale_is_one in ((1.0, True), (2.0, False)):
         density = density_of(make_history(clean + factor * noise, travel=travel), stage)
         _, scale, _, chi_square, dof = density.settings(np.full((5, 1), 0.2))
-        assert dof == pytest.approx(2 * 60 - 2 - 1, abs=0.01)
+        assert dof == pytest.approx(2 * 60 - 2, abs=0.01)  # the coordinate is given
         assert abs(chi_square / dof - 1) < 5 * np.sqrt(2 / dof)
         assert (scale < 1.1) == scale_is_one
+
+
+def test_coefficients_within_their_priors_take_no_degree_of_freedom(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of lives whose covariate acts as its prior states, a twentieth has a p value below 0.05."""
+    for name, value in {"WALK_STDS": 1e-6, "NOISE_SCALES": 1.0, "DEVIATION_STDS": 0.0}.items():
+        monkeypatch.setattr(constants, name, (value,))
+        prior = re.sub(r"(_STD)?S$", "_PRIOR", name)
+        monkeypatch.setattr(constants, prior, (1.0,))
+    monkeypatch.setattr("lmshealth.stage.constants.MAP_ERRORS", ((1.0, 1.0),))
+    stage = make_stage(tmp_path, (FADING,), model_std=1e-6, tail=TEMPERATURE + LAWS_ALONE)
+    rng, n, p_values = np.random.default_rng(14), 6, []
+    travel, y = np.linspace(0, 1e6, n), np.full((5, 1), 0.2)
+    clean = true_drift(("guide_preload",), np.log(1 - 0.2 * travel[:, None] / 1e6))[:, :2]
+    (covariate,) = stage.description.covariate
+    for _ in range(300):
+        warmth = rng.normal(0, 6, n)
+        moved = np.outer(warmth, covariate.prior_std * rng.standard_normal(2))
+        history = make_history(
+            np.log(FREQUENCY[:2]) + clean + moved + 3e-4 * rng.standard_normal((n, 2)),
+            travel=travel, std=3e-4, temperature=covariate.reference + warmth,
+        )  # fmt: skip
+        *_, chi_square, freedom = density_of(history, stage).settings(y)
+        p_values.append(stats.chi2.sf(chi_square, [freedom, freedom - 2]))
+    # Negative control: the two coefficients would take two degrees of freedom.
+    few, many = (np.array(p_values) < 0.05).sum(axis=0).tolist()
+    assert stats.binomtest(few, 300, 0.05).pvalue > 1e-3
+    assert stats.binomtest(many, 300, 0.05).pvalue < 1e-6
 
 
 @pytest.fixture

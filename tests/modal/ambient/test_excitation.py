@@ -198,7 +198,9 @@ def test_an_average_that_is_not_credible_leaves_the_mode(monkeypatch: pytest.Mon
     monkeypatch.setattr(
         cluster_fit,
         "average_colours",
-        lambda _, p, white, ratio: Colour(white.mean + away, white.cov, 0.5),
+        lambda _, p, white, ratio: Colour(
+            white.mean + away, white.cov, np.zeros_like(white.cov), 0.5
+        ),
     )
     found = identify(forced(1, np.ones(24_000)), STAGE)
     assert found.frequency[0] == pytest.approx(100.0, abs=0.5)
