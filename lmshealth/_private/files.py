@@ -49,8 +49,8 @@ def escapes(path: Path, folder: Path) -> bool:
 
 
 def write_text(target: Path, text: str) -> None:
-    """Write a text as `replacing` does, with missing folders, or raise `BadTable`."""
-    with _writing(target), replacing(target) as stream:
+    """Write a text as `replacing` does."""
+    with replacing(target) as stream:
         stream.write(text)
 
 
@@ -64,10 +64,12 @@ def write_bytes(target: Path, content: bytes) -> None:
 def replacing(target: Path) -> Iterator[IO[str]]:
     """Open a text file that replaces another in one step, once it is complete.
 
-    A symbolic link in its place is replaced, not followed.
+    Missing folders are made. A symbolic link in its place is replaced, not followed. `BadTable` if
+    it cannot be written.
     """
     odd = "backslashreplace"  # one unprintable name must not keep all others from being written
     with (
+        _writing(target),
         _in_place_of(target) as part,
         part.open("a", encoding="utf-8", errors=odd, newline="\n") as stream,
     ):

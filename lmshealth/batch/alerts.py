@@ -8,7 +8,7 @@ import os
 import signal
 import subprocess
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Container, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import date
 from pathlib import Path, PurePath
@@ -55,6 +55,11 @@ class Scope(NamedTuple):
     out: Path
     began: int
 
+    @property
+    def folder(self) -> str:
+        """Folder of the logs, as the store has it."""
+        return shown(os.path.abspath(self.logs))
+
 
 def last_number(store: Store) -> int:
     """Return the number of the last comparison on a store; 0 without one."""
@@ -71,7 +76,7 @@ def announce(
     `Store.alone`; return statuses, changes, and notes of damage.
     """
     unsent, everything = store.unsent(), store.announced()
-    folder, notes = shown(os.path.abspath(scope.logs)), list[str]()
+    folder, notes = scope.folder, list[str]()
     inside = {k for k, one in everything.items() if PurePath(one.folder).is_relative_to(folder)}
     own = {stage: one for stage, one in everything.items() if stage in inside | made.keys()}
     known = {stage: one.status for stage, one in own.items()}
@@ -152,12 +157,12 @@ def _row(change: Change, status: Status, out: Path) -> dict[str, Any]:
     return row | {"text": str(change), "DeviceHealth": status.device_health, "page": page}
 
 
-def write_statuses(machines: Sequence[Status], out: Path) -> None:
-    """Write the status of each machine and of all."""
-    # Where the page of a machine that is gone has the name of another, the newer one is kept.
+def write_statuses(machines: Sequence[Status], made: Container[str], out: Path) -> None:
+    """Write the status of each machine and of all; those in ``made`` have a result in this run."""
+    # Where the page of a machine that is gone has the name of another, that of this run is kept.
     documents: list[tuple[str, Status | Fleet]] = [
         (f"{Path(one.page).stem}.status.json", one)
-        for one in sorted(machines, key=lambda one: one.recorded_at)
+        for one in sorted(machines, key=lambda one: (one.stage in made, one.recorded_at))
     ]
     for name, document in (*documents, (FILE, Fleet(tuple(machines)))):
         encoded = msgspec.json.encode(document, enc_hook=lambda number: number.item())

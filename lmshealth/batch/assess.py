@@ -223,7 +223,7 @@ def reason_if_failed(
     except raised:
         raise
     except LmshealthError as error:
-        return str(error)
+        return str(error).removeprefix(f"{machine}: ")  # those who list it name the machine
     except Exception as error:
         _logger.exception("%s", machine)
         return unexpected(error, "its logs")

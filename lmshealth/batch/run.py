@@ -36,7 +36,14 @@ from lmshealth.batch.assess import (
     unpack_logs,
 )
 from lmshealth.batch.ingest import Ingested, Settings, ingest
-from lmshealth.batch.store import Resources, Store, cached, default_url, unpack_or_none
+from lmshealth.batch.store import (
+    Published,
+    Resources,
+    Store,
+    cached,
+    default_url,
+    unpack_or_none,
+)
 from lmshealth.batch.workers import Progress
 from lmshealth.errors import LmshealthError, NothingUsable
 from lmshealth.io.log import Refusal
@@ -45,6 +52,7 @@ from lmshealth.io.refusal import listed, visible
 from lmshealth.machine.assessment import Assessment
 from lmshealth.machine.status import Change, Status, judge_on, make_status, on_day
 from lmshealth.machine.summary import Summary, summarise
+from lmshealth.modal.log_estimates import LogEstimates
 from lmshealth.report.language import Language, in_language
 from lmshealth.report.pages import by_urgency, date_page, file_names, make_page, write_index
 from lmshealth.report.tables import csv_text, join_csv, log_tables, machine_tables, refused_rows
@@ -104,9 +112,7 @@ def machine_output(record: MachineRecord) -> MachineOutput | None:
         page = make_page(found, summary, before=record.before)
     rows = machine_tables(found, summary) if logs else {}
     tables = {name: csv_text(name, own) for name, own in rows.items()}
-    of_logs = [log_tables(one) for one in sort_by_time(logs)]
-    for name in of_logs[0] if of_logs else ():
-        tables[name] = "".join(join_csv([one[name] for one in of_logs]))
+    tables |= _tables_of_logs(logs)
     return MachineOutput(
         page=page,
         summary=summary,
@@ -114,6 +120,13 @@ def machine_output(record: MachineRecord) -> MachineOutput | None:
         excluded=tuple(r.log for r in found.refused if r.reason in LEFT_OUT),
         status=status,
     )
+
+
+def _tables_of_logs(logs: Sequence[LogEstimates]) -> dict[str, str]:
+    """Return the tables of the logs of a machine as CSV, by name."""
+    of_logs = [log_tables(one) for one in sort_by_time(logs)]
+    names = of_logs[0] if of_logs else ()
+    return {name: "".join(join_csv([one[name] for one in of_logs])) for name in names}
 
 
 @dataclass(frozen=True, slots=True)
@@ -148,6 +161,7 @@ def write_tables(
     """Replace the tables of a run, all at its end: an interrupted run leaves those before.
 
     Of some machines there are packed tables by name; those of no machine (``""``) come first.
+    `BadTable` if a table cannot be written.
     """
     parts = [tables[machine] for machine in ("", *machines) if machine in tables]
     with ExitStack() as stack:
@@ -211,7 +225,8 @@ def run(
     BadStage
         If the stages are no results of `load_stage`.
     NothingUsable
-        If there is no log, or every log was refused; ``refused.csv`` is written nevertheless.
+        If there is no log, or every log was refused; tables and ``index.html`` are written
+        nevertheless.
 
     Examples
     --------
@@ -255,21 +270,20 @@ def run(
         failed = assess_all(machines, resources)
         usable = [machine for machine in machines if machine.name not in failed]
         judging = _judging(settings)
-        rows, lacking, made = _report(usable, refused, resources, out, judging)
+        rows, lacking, made = _report(usable, refused, resources, out, judging, scope.folder)
         present = {name: output.status for name, output in made.items()}
-        tables = {name: output.tables for name, output in made.items()}
+        tables = _tables(machines, made, store)
         with store.alone():  # a run that ends before its tables are written has announced nothing
             found = announce(store, present, judging.today, settings.alerts, scope)
             statuses, changes, notes = found
             changed = [msgspec.to_builtins(change) for change in changes]
             of_run = {"refused": refused_rows(refused), "changes": changed}
             tables[""] = {name: pack(csv_text(name, own)) for name, own in of_run.items()}
-            write_tables(out, [machine.name for machine in usable], tables)
-        if machines:
-            with in_language(settings.language):
-                write_index(out, rows, refused, today=judging.today)
+            write_tables(out, [machine.name for machine in machines], tables)
+        with in_language(settings.language):
+            write_index(out, rows, refused, today=judging.today)
         unsent = deliver(store, statuses, settings.alerts, out)
-        write_statuses(statuses, out)
+        write_statuses(statuses, made, out)
         notes += [*store.notes, *without_logs(work.actions, ingested.machines)]
         notes += _of_names(ingested.machines, [one.stage for one in statuses])
     counts, lost = _count(ingested, refused, made)
@@ -323,12 +337,13 @@ def report(
     """
     out = Path(out)
     _prepare(out)
-    present = store.published()
+    announced = store.announced()
+    present = _present(store, announced)
     files = file_names([one.machine for one in present])
     rows, failed = dict[str, Summary](), dict[str, str]()
     progress("reporting", 0, len(present))
-    announced = {stage: one.status for stage, one in store.announced().items()}
-    judging = replace(_judging(settings), before=announced)
+    before = {stage: one.status for stage, one in announced.items()}
+    judging = replace(_judging(settings), before=before)
     refused = store.refused(one.refused for one in present)
     record = _records(store, refused, settings.language)
     # A process takes longer to start than a page to write.
@@ -355,6 +370,19 @@ def report(
         failed={one.machine: unread for one in present if one.machine not in rows} | failed,
         notes=tuple(store.notes),
     )
+
+
+def _present(store: Store, announced: Container[str]) -> list[Published]:
+    """List the published assessments without those of machines that are retired.
+
+    The row of what was announced of such a machine was deleted; other machines of its folder, which
+    have one list of refused logs with it, have theirs.
+    """
+    published = store.published()
+    if store.damaged["announced"]:  # it is not known of which machines
+        return list(published)
+    folders = {one.refused for one in published if one.machine in announced}
+    return [one for one in published if one.machine in announced or one.refused not in folders]
 
 
 def _judging(settings: Settings = Settings()) -> Judging:
@@ -445,14 +473,16 @@ def _report(
     resources: Resources,
     out: Path,
     judging: Judging,
+    folder: str = "",
 ) -> tuple[tuple[Summary, ...], dict[str, str], dict[str, MachineOutput]]:
     """Write pages; return summaries, why machines have none, and all outputs without their pages.
 
-    Machines whose assessment is missing, or cannot be decoded, are assessed once more.
+    ``folder`` is that of the refused logs. Machines whose assessment is missing, or cannot be
+    decoded, are assessed once more.
     """
     store, names = resources.store, [machine.name for machine in machines]
     files, own_keys = file_names(names), {machine.name: machine.key for machine in machines}
-    refused_key = store.put_refused(tuple(refused))
+    refused_key = store.put_refused(tuple(refused), folder)
     record = _records(store, refused, judging.language)
     rows, made = dict[str, Summary](), dict[str, MachineOutput]()
     failed, not_updated = dict[str, str](), dict[str, str]()
@@ -478,6 +508,25 @@ def _report(
             break
     unread = {machine.name: "its assessment cannot be read back from the store" for machine in left}
     return tuple(by_urgency(rows.values())), not_updated | unread | failed, made
+
+
+def _tables(
+    machines: Sequence[Machine], made: Mapping[str, MachineOutput], store: Store
+) -> dict[str, dict[str, bytes]]:
+    """Return the packed tables of machines; of those without an output, what their logs give."""
+    tables = {name: output.tables for name, output in made.items()}
+
+    def of_logs(machine: Machine) -> dict[str, bytes]:
+        logs = unpack_logs(packed_logs(machine, store))
+        rows = refused_rows([own for one in logs for own in one.modes.refused])
+        texts = {"refused": csv_text("refused", rows), **_tables_of_logs(logs)}
+        return {name: pack(text) for name, text in texts.items()}
+
+    for machine in machines:
+        if machine.name not in made:
+            found = reason_if_failed(partial(of_logs, machine), machine.name)
+            tables[machine.name] = {} if isinstance(found, str) else found
+    return tables
 
 
 def _outputs(

@@ -91,7 +91,8 @@ class PackedAssessment:
 class Published:
     """Key of the assessment of a machine that was published last, and of its refused logs.
 
-    ``kept`` are the keys of all its assessments that were stored then.
+    Machines of one folder of logs have one list of refused logs, that of the last run over it.
+    ``kept`` are the keys of all assessments of the machine that were stored then.
     """
 
     machine: str
@@ -301,9 +302,12 @@ class Store:
         is_lost = any(after in one.kept for one in present)
         return None if is_lost else self.get("parts", key, machine)
 
-    def put_refused(self, refused: tuple[Refusal, ...]) -> str:
-        """Store a list of logs that were refused as a whole, and return its key."""
-        key = fingerprint(refused)
+    def put_refused(self, refused: tuple[Refusal, ...], folder: str = "") -> str:
+        """Store the logs of a folder that were refused as a whole, and return the key of the list.
+
+        It takes the place of the list that an earlier run over the folder has stored.
+        """
+        key = fingerprint("refused logs", folder)
         self.put("refused", {key: pack(refused)})
         return key
 

@@ -82,6 +82,14 @@ def _finish(result: RunResult, pdf: bool, prefix: str = "") -> None:
         write_pdfs(result.pages)
 
 
+def _status(result: RunResult) -> int:
+    """Return the exit status of a run or a report."""
+    if result.failed and not result.rows:  # every machine
+        return 1
+    lost = result.n_refused or result.n_unlisted or result.n_unread or result.failed
+    return options.SOME_REFUSED if lost else 0
+
+
 @options.command(
     "run logs/ --stage lms-y --out result/",
     "run exports/ --columns map.toml --stage my-stage.toml --out result/",
@@ -122,8 +130,7 @@ def run(
             terminal.print_line(f"{rest} more changes; changes.csv lists all.")
         terminal.print_line(f"Report: {result.index}")
     _finish(result, pdf)
-    some = result.n_refused or result.n_unlisted or result.n_unread or result.failed
-    ctx.exit(options.SOME_REFUSED if some else 0)
+    ctx.exit(_status(result))
 
 
 @options.command(
@@ -161,7 +168,10 @@ def watch(logs: Path, stages: tuple[Stage, ...], out: Path, interval: float, **g
             )
             for change in result.changes:
                 terminal.print_line(f"{now}{change}")
-        _finish(result, pdf, now)
+        try:
+            _finish(result, pdf, now)
+        except LmshealthError as error:
+            terminal.print_errors([now + str(error)])
 
 
 @options.command(
@@ -199,4 +209,4 @@ def report(
         result = write_pages(opened, out, settings, progress)
     terminal.print_line(f"Report: {result.index}")
     _finish(result, pdf)
-    ctx.exit(options.SOME_REFUSED if result.failed or result.notes else 0)
+    ctx.exit(_status(result) or (options.SOME_REFUSED if result.notes else 0))

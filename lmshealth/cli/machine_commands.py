@@ -15,7 +15,7 @@ from lmshealth._private.tables import Row
 from lmshealth.cli import options, views
 from lmshealth.cli.terminal import PATIENCE, print_errors, print_notes, progress_bars
 from lmshealth.errors import NotConverged, NotEnoughData
-from lmshealth.io.log import Refusal
+from lmshealth.io.log import Refusal, utc_day
 from lmshealth.life.health import Health, epochs_to_publish, health_of, infer_drifts
 from lmshealth.life.posterior.fit import LifePosterior, fit_life
 from lmshealth.life.prognosis import prognosis_of
@@ -83,7 +83,7 @@ def track(ctx: click.Context, /, table: Path, **given: Any) -> None:
         progress("tracking", len(machines), len(machines))
     for (history, refused), found in zip(machines, tracked, strict=True):
         smoothed = None
-        refused += outlier_refusals(history, found)
+        refused += outlier_refusals(history, found, stage)
         if given["smoothed"]:
             smoothed = smooth(accepted_estimates(history, found), found, stage)
         own = tables.track_tables(found, smoothed) | {"refused": tables.refused_rows(refused)}
@@ -258,7 +258,7 @@ def prognose(ctx: click.Context, /, table: Path, **given: Any) -> None:
     for prognosis, _ in found:
         done = work.of(prognosis.stage).since(prognosis.recorded_at)
         left = without_limits(prognosis, restored(words, done))
-        shown, last = left or prognosis, prognosis.recorded_at.date()
+        shown, last = left or prognosis, utc_day(prognosis.recorded_at)
         life, service = summarise_life(shown, stage, whole=prognosis), decide(left, decision)
         before = None
         if by is not None and by > last:

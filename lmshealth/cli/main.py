@@ -34,7 +34,7 @@ _COMMANDS = {
     "check-calibration": ("stage_commands", "Check coverage and detection on simulated lives."),
     "error": ("log_commands", "Analyse the following error."),
     "frf": ("log_commands", "Measure a frequency response and identify its modes."),
-    "infer": ("machine_commands", "Infer the health parameters from a track."),
+    "infer": ("machine_commands", "Infer the health parameters from estimates or drifts."),
     "init": ("log_commands", "Propose column map, manifest and description from logs."),
     "modes": ("log_commands", "Identify the modes of single logs."),
     "plan": ("stage_commands", "Plan the logs that are needed to detect a loss."),

@@ -125,9 +125,8 @@ def follow_links() -> bool:
 
 def described(reference: str) -> Stage:
     """Load a stage description as ``--follow-links`` allows."""
-    stage = load_stage(reference, follow_links=follow_links())
     _inputs().append(Path(reference))
-    return stage
+    return load_stage(reference, follow_links=follow_links())
 
 
 def stage_option(*name: str, **settings: Any) -> Callable[[Callable[..., Any]], Any]:
@@ -169,7 +168,7 @@ def _columns(ctx: click.Context, option: click.Parameter, path: Path | None) -> 
     return replace(ColumnMap() if path is None else load_columns(path), layouts=own)
 
 
-_LAYOUTS, _INPUTS = f"{__name__}.layouts", f"{__name__}.inputs"
+_LAYOUTS, _INPUTS, _LOG = (f"{__name__}.{name}" for name in ("layouts", "inputs", "log"))
 LAYOUTS = eager_option(
     "--layouts",
     type=FOLDER,
@@ -298,17 +297,17 @@ def band_option(text: str) -> Callable[[Any], Any]:
     )
 
 
-def _log(ctx: click.Context, option: click.Parameter, given: Any) -> None:
-    """Begin to log to standard error (``-v``), or to a file."""
-    if not given:
-        return
-    if option.name == "verbose":
-        handler: logging.Handler = logging.StreamHandler()
-        handler.addFilter(lambda record: not hasattr(record, "printed"))
-    else:
-        handler = logging.FileHandler(given, encoding="utf-8")
+def _log_to(ctx: click.Context, handler: logging.Handler) -> None:
     handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(message)s"))
     terminal.start_log(ctx, handler)
+
+
+def _verbose(ctx: click.Context, option: click.Parameter, given: bool) -> None:
+    """Begin to log to standard error."""
+    if given:
+        handler = logging.StreamHandler()
+        handler.addFilter(lambda record: not hasattr(record, "printed"))
+        _log_to(ctx, handler)
 
 
 _OUTPUT = (
@@ -321,11 +320,14 @@ _OUTPUT = (
     eager_option(
         *("-v", "--verbose"),
         is_flag=True,
-        callback=_log,
+        callback=_verbose,
         help="Print a line per event on standard error, with its time.",
     ),
     eager_option(
-        "--log-file", type=OUT, callback=_log, help="Append events, notes and errors to a file."
+        "--log-file",
+        type=OUT,
+        callback=lambda ctx, option, path: ctx.meta.update({_LOG: path}),  # opened by `_Command`
+        help="Append events, notes and errors to a file.",
     ),
 )
 
@@ -334,11 +336,21 @@ class _Command(click.Command):
     """A command that writes no file over one that it reads, and no two into one."""
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
-        """Require that each output is a file of its own."""
-        left = super().parse_args(ctx, args)
-        names = {path.resolve(): "the input" for path in _inputs()}
+        """Require that each output is a file of its own, then begin the log in its file."""
+        try:
+            left = super().parse_args(ctx, args)
+        except LmshealthError:  # such as of a description: the log has it too
+            self._begin_log(ctx)
+            raise
+        self._begin_log(ctx)
+        return left
+
+    def _begin_log(self, ctx: click.Context) -> None:
+        """Refuse an output that is another file of the command; open the log if it is none."""
+        log, names = ctx.meta.get(_LOG), {path.resolve(): "the input" for path in _inputs()}
+        params = {**ctx.params, "log_file": log}
         for option in sorted(self.params, key=lambda one: one.type is OUT):
-            given = ctx.params.get(option.name or "")
+            given = params.get(option.name or "")
             for path in given if isinstance(given, tuple) else (given,):
                 if not isinstance(path, Path) or (path.exists() and not path.is_file()):
                     continue  # several outputs may be discarded into one device
@@ -347,7 +359,8 @@ class _Command(click.Command):
                     name = name if name.startswith("-") else "the input"
                     detail = f"{path} is also {name}; needed is another file"
                     raise click.BadParameter(detail, ctx, option)
-        return left
+        if log:
+            _log_to(ctx, logging.FileHandler(log, encoding="utf-8"))
 
 
 def command(*examples: str) -> Callable[[Callable[..., Any]], click.Command]:

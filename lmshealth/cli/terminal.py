@@ -158,7 +158,8 @@ def quiet() -> bool:
 
 
 def start_log(context: click.Context, handler: logging.Handler) -> None:
-    """Send records of the package to a handler until the command ends."""
+    """Send records of the package to a handler until the program ends, which prints its error."""
+    context = context.find_root()  # that of a command ends before, or not at all for a bad option
     logger = logging.getLogger("lmshealth")
     logger.setLevel(logging.INFO)
     logger.addHandler(handler)

@@ -374,17 +374,21 @@ def _doubts(row: Row, *, determined: bool) -> Iterator[str]:
         yield "not determined by these drifts."
 
 
+# Steps whose sentence is about what is only on the page.
+_ON_TERMINAL = {"record": "Record further logs; the page has the reasons."}
+
+
 def print_summaries(summaries: Sequence[Summary]) -> None:
     """Print the results of a run, most urgent first: a few machines in full, many in a table."""
     if len(summaries) <= constants.TERMINAL_MACHINES:
         for one in summaries:
             print_text(f"{one.identity}: {_verdict(one)}. {one.why}")
-            if to_do := text.next_step(one.step):
+            if to_do := _ON_TERMINAL.get(one.step.kind) or text.next_step(one.step):
                 print_text(f"  {to_do}")
             for parameter in one.health:
                 print_text(f"  {_parameter(parameter)}")
             if one.life is not None:
-                print_life(one.life, one.service, when=text.service_on_day(one))
+                print_life(one.life, one.service, when=text.service_on_day(one), today=one.today)
         return
     shown = [
         {
@@ -428,11 +432,12 @@ def print_life(
     before: tuple[date, FloatArray] | None = None,
     *,
     when: str = "",
+    today: date | None = None,
 ) -> None:
     """Print the quantiles of the remaining life for each limit and any, then the service.
 
     ``before`` is a day with the probabilities that each limit is reached before it; ``when`` is the
-    service as of a day, by default that at the last log.
+    service as of the day ``today``, by default that at the last log.
     """
     blocks = [list(_limit_cells(life, k, before)) for k in range(len(life.limits))]
     # Rows of any limit that are those of one limit, but for its name, are not repeated.
@@ -458,7 +463,7 @@ def print_life(
     if life.restored:
         names = ", ".join(map(spell, life.restored))
         print_text(f"Not included: the limit of {names}, which later work has restored.")
-    for sentence in _advice(life, service, when):
+    for sentence in _advice(life, service, when, today):
         print_text(sentence)
     print_line("")
 
@@ -485,7 +490,7 @@ def _limit_cells(
         yield (f"  before {asked}: {text.probability_range(bounds[:, index].tolist())}",)
 
 
-def _advice(life: Life, service: Service, when: str) -> Iterator[str]:
+def _advice(life: Life, service: Service, when: str, today: date | None) -> Iterator[str]:
     """Yield when to service, by which rule, and the risk of a planned service."""
     if math.isnan(service.wait):
         yield "Service: not known before a log shows the effect of the work that was entered."
@@ -509,12 +514,20 @@ def _advice(life: Life, service: Service, when: str) -> Iterator[str]:
     elif not service.max_risk or risk != text.percent(service.max_risk):
         yield f"Probability that a limit is reached before that day, at most: {risk}."
     if service.inspect_by is not None:
-        every = service.inspect_every
-        often = f", then every {text.whole_km(every)}" if math.isfinite(every) else ""
-        yield f"Inspect (record a log) by {service.inspect_by}{often}."
+        yield from _inspection(service, service.inspect_by, today)
     if service.planned is not None:
         planned = text.probability_range(service.planned_risk)
         yield f"Before the service planned for {service.planned}: {planned}."
+
+
+def _inspection(service: Service, by: date, today: date | None) -> Iterator[str]:
+    """Yield when to record a log; nothing where a log was due, but the service is due now."""
+    every = service.inspect_every
+    often = f", then every {text.whole_km(every)}" if math.isfinite(every) else ""
+    if today is None or by >= today:
+        yield f"Inspect (record a log) by {by}{often}."
+    elif service.kind != "now":
+        yield f"A log was due by {by}: record one now{often}."
 
 
 def print_calibration(check: CalibrationCheck) -> None:

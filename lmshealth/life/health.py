@@ -15,6 +15,7 @@ from lmshealth._private.result import Result
 from lmshealth._private.serialize import stream
 from lmshealth._private.tables import TABLES
 from lmshealth.errors import BadQuestion, BadStage, NotEnoughData
+from lmshealth.io.log import utc_day
 from lmshealth.life import constants
 from lmshealth.life.posterior.data import clock_and_steps, clock_travel, with_clock
 from lmshealth.life.posterior.fit import LifePosterior, LoneMode, fit_life
@@ -134,7 +135,7 @@ class Health(Result):
     def title(self) -> str:
         """Return machine, number of epochs, and the last one."""
         n = len(self.recorded_at)
-        last = f"; posterior at {self.recorded_at[-1].date()}" if n else ""
+        last = f"; posterior at {utc_day(self.recorded_at[-1])}" if n else ""
         return f"Health of {self.stage}: {n} epochs{last}"
 
     def digest_columns(self) -> dict[str, Any]:

@@ -13,6 +13,7 @@ from lmshealth._private.result import Result
 from lmshealth._private.serialize import stream
 from lmshealth._private.tables import fact
 from lmshealth.errors import BadStage, NotEnoughData
+from lmshealth.io.log import utc_day
 from lmshealth.life import constants
 from lmshealth.life.posterior.data import KM, SECONDS_PER_DAY, with_clock
 from lmshealth.life.posterior.fit import LifePosterior, LoneMode, fit_life
@@ -103,7 +104,7 @@ class Prognosis(Result):
 
     def title(self) -> str:
         """Return machine, moment, odometer and horizon."""
-        at = f"{self.recorded_at.date()} at {self.travel / 1000:.6g} km"
+        at = f"{utc_day(self.recorded_at)} at {self.travel / 1000:.6g} km"
         horizon = f"{self.horizon / 1000:.6g} km"
         return f"Prognosis of {self.stage} on {at}: remaining travel in km, at most {horizon}"
 

@@ -12,6 +12,7 @@ from scipy.special import expit, logit
 
 from lmshealth._private.arrays import BoolArray
 from lmshealth._private.tables import fact, spell
+from lmshealth.io.log import utc_day
 from lmshealth.life import constants
 from lmshealth.life.health import Health
 from lmshealth.life.posterior.fit import LoneMode
@@ -260,7 +261,7 @@ def _alarm_sentences(track: Track | None, baseline: int) -> Iterator[str]:
         k = track.modes.index(mode)
         moved, std = track.drift[-1, k], np.sqrt(track.drift_cov[-1, k, k])
         size = f"{100 * np.expm1(moved):+.2f} ± {100 * np.exp(moved) * std:.2f} %"
-        when, name = track.recorded_at[event.epoch].date().isoformat(), spell(mode)
+        when, name = utc_day(track.recorded_at[event.epoch]).isoformat(), spell(mode)
         size = size.replace("-", "−")
         yield fact(
             "Alarm since {day}: {name} has moved by {size} since the baseline.",
@@ -277,7 +278,7 @@ def _judge_step(
     for epoch in sorted({event.epoch for event in jumps}):
         own = (event for event in jumps if event.epoch == epoch)
         sizes = ", ".join(f"{one.mode} {100 * np.expm1(one.size):+.1f} %" for one in own)
-        when, moved = history.recorded_at[epoch].date().isoformat(), sizes.replace("-", "−")
+        when, moved = utc_day(history.recorded_at[epoch]).isoformat(), sizes.replace("-", "−")
         sentences.append(
             fact(
                 "The frequencies jumped before the log of {day} ({sizes}), and no declared "

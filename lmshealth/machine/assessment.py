@@ -16,7 +16,7 @@ from numpy.linalg import LinAlgError
 from lmshealth._private.serialize import fingerprint, seed_of
 from lmshealth._private.tables import fact
 from lmshealth.errors import BadQuestion, LmshealthError, NotEnoughData
-from lmshealth.io.log import Notice, Refusal
+from lmshealth.io.log import Notice, Refusal, utc_day
 from lmshealth.io.refusal import listed
 from lmshealth.life import constants, fleet_prior
 from lmshealth.life.health import Health, epochs_to_publish, health_of
@@ -94,7 +94,7 @@ class Assessment:
 
     def __repr__(self) -> str:
         judged, service = self.judgement, self.service()
-        at = f"{judged.recorded_at.date()}: {judged.verdict}"
+        at = f"{utc_day(judged.recorded_at)}: {judged.verdict}"
         lines = [f"Assessment of {judged.stage} at {at}", judged.why]
         lines += [f"Service: {service.kind} {service.by or ''}".rstrip()] * bool(self.prognosis)
         parts = ("history", "track", "health", "prognosis")

@@ -2,12 +2,13 @@
 
 from collections.abc import Collection
 from dataclasses import dataclass, replace
-from datetime import date, datetime, time, timedelta
+from datetime import UTC, date, datetime, time, timedelta
 from typing import Literal
 
 import numpy as np
 
 from lmshealth._private.arrays import FloatArray
+from lmshealth.io.log import utc_day
 from lmshealth.life.posterior.data import SECONDS_PER_DAY
 from lmshealth.life.prognosis import Prognosis
 from lmshealth.machine import constants
@@ -73,7 +74,7 @@ def decide(prognosis: Prognosis | None, decision: Decision) -> Service:
     by, planned = day_after(prognosis, wait), decision.next_service
     kind: Literal["now", "by", "later", "unknown"] = "later" if np.isinf(wait) else "unknown"
     if by is not None:
-        kind = "now" if by <= prognosis.recorded_at.date() else "by"
+        kind = "now" if by <= utc_day(prognosis.recorded_at) else "by"
     risk = np.nan if by is None else risk_before(prognosis, by)[1]
     planned_risk = unknown if planned is None else risk_before(prognosis, planned)
     every, earliest = _inspection(prognosis, decision)
@@ -155,10 +156,9 @@ def probability_before(prognosis: Prognosis, day: date) -> FloatArray:
 
     Shape ``(2, n_parameters + 1)``: at least, at most. They differ if draws pass the horizon before
     that day, beyond which nothing is published: such a draw is a failure in the upper one only. The
-    day is in the time zone of the last log; a day before that log counts as its moment.
+    day is in UTC; a day before the last log counts as its moment.
     """
-    moment = prognosis.recorded_at
-    ahead = datetime.combine(day, time(), moment.tzinfo) - moment
+    ahead = datetime.combine(day, time(), UTC) - prognosis.recorded_at
     days = max(ahead.total_seconds() / SECONDS_PER_DAY, 0.0)
     within = np.minimum(prognosis.remaining, prognosis.horizon)
     maybe = within <= days * prognosis.usage[:, None]
@@ -187,7 +187,7 @@ def day_after(prognosis: Prognosis, wait: float) -> date | None:
     None if the wait is infinite or beyond the calendar.
     """
     try:
-        return (prognosis.recorded_at + timedelta(days=max(wait, 0.0))).date()
+        return utc_day(prognosis.recorded_at + timedelta(days=max(wait, 0.0)))
     except OverflowError:
         return None
 

@@ -80,10 +80,10 @@ def _of_track(assessment: Assessment) -> Iterator[Notice]:
         yield _noticed(key, ", ".join(modes), n=n, names=_listed(modes))
     first = assessment.history.baseline
     if track is not None and (modes := [mode for k, mode in track.outliers if k == first]):
-        day = track.recorded_at[first].date().isoformat()
+        day = utc_day(track.recorded_at[first]).isoformat()
         yield _noticed("baseline-left-out", ", ".join(modes), names=_listed(modes), day=day)
     if track is not None and track.suspected is not None:
-        day = track.recorded_at[track.suspected.first].date().isoformat()
+        day = utc_day(track.recorded_at[track.suspected.first]).isoformat()
         yield _noticed("step-suspected", day=day)
     if track is not None and not (found := track.consistency()).holds:
         notice = _noticed(
@@ -207,6 +207,8 @@ class Status(msgspec.Struct, frozen=True, kw_only=True):
     conditions: dict[str, DeviceHealth] = {}  # `conditions`; the first one is `device_health`
     silent: bool = False  # no log for longer than `silent_after_days`
     silent_after_days: float | None = None  # ``--silent-days``, or by the own intervals
+    # By the own intervals: 0 with logs of a single day, None in statuses of earlier versions.
+    own_silent_after_days: float | None = None
     days_without_log: int = 0
     unknown_since: date | None = None  # day of the last log, if the verdict is `UNKNOWN`
     verdict: str  # on the day of the run
@@ -324,13 +326,15 @@ def make_status(assessment: Assessment, summary: Summary) -> Status:
         }
         for one in shown
     ]
+    after = _silent_after(assessment.history.recorded_at)
     made = Status(
         stage=summary.identity,
         page=summary.file,
         description=assessment.stage.name,
         recorded_at=summary.recorded_at,
         baseline_at=summary.baseline_at,
-        silent_after_days=_silent_after(assessment.history.recorded_at),
+        silent_after_days=after,
+        own_silent_after_days=after or 0.0,
         verdict=summary.verdict,
         verdict_at_last_log=summary.verdict,
         probability=finite_or_none(summary.probability),
@@ -384,7 +388,8 @@ def judge_on(status: Status, today: date, silent_days: float | None) -> Status:
 
     Without ``silent_days`` a silence begins by the intervals of the machine's own logs.
     """
-    after = silent_days or status.silent_after_days
+    own = status.own_silent_after_days
+    after = silent_days or (status.silent_after_days if own is None else own or None)
     # A status of an earlier schema is written again in this one.
     status = msgspec.structs.replace(status, schema=constants.JSON_SCHEMA, silent_after_days=after)
     return _judged(status, today)
@@ -451,10 +456,10 @@ def _transitions(before: Status | None, now: Status, today: date) -> Iterator[tu
     elif before and before.alarms and not now.alarms:
         yield "recovered", f"alarm {' '.join(before.alarms)}", "no alarm"
     if now.silent and not _was_silent(before):
-        last = now.recorded_at.date().isoformat()
+        last = utc_day(now.recorded_at).isoformat()
         yield "silent", f"last log of {last}", f"no log for {now.days_without_log} days"
     elif before is not None and _was_silent(before) and "silent" not in now.announced:
-        last, latest = (one.recorded_at.date().isoformat() for one in (before, now))
+        last, latest = (utc_day(one.recorded_at).isoformat() for one in (before, now))
         yield "recovered", f"no log since {last}", f"log of {latest}"
     earlier = before.conditions if before else {}
     for code in _ENDING:
@@ -471,7 +476,7 @@ def _ended(before: Status, now: Status, today: date) -> Iterator[tuple[str, str]
         ended -= {"unconfirmed-jump"}
     # Not by another day or description.
     if now.recorded_at > before.recorded_at and not _was_silent(before):
-        why = f"log of {now.recorded_at.date().isoformat()}"
+        why = f"log of {utc_day(now.recorded_at).isoformat()}"
         yield from ((code, why) for code in _ENDING if code in ended)
     elif _is_worked_on(before, now):
         if _is_near(now.service_by, today):  # without a verdict it is no condition, and still due

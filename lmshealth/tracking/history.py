@@ -12,7 +12,7 @@ from lmshealth._private.arrays import BoolArray, FloatArray, ReadOnly, freeze
 from lmshealth._private.result import Result
 from lmshealth._private.tables import fact
 from lmshealth.errors import NotEnoughData
-from lmshealth.io.log import Notice, Refusal
+from lmshealth.io.log import Notice, Refusal, utc_day
 from lmshealth.modal.log_estimates import LogEstimates
 from lmshealth.modal.modes import Modes
 from lmshealth.stage.description import ModeSpec, Stage, search_offset
@@ -125,7 +125,7 @@ class History(Result):
         """Return machine, number of logs, and their time and travel."""
         ends = ""
         if self.logs:
-            ends = f", {self.recorded_at[0].date()} to {self.recorded_at[-1].date()}"
+            ends = f", {utc_day(self.recorded_at[0])} to {utc_day(self.recorded_at[-1])}"
             if self.has_odometer:
                 ends += f", {self.travel[0] / 1000:.6g} to {self.travel[-1] / 1000:.6g} km"
         return f"History of {self.stage}: {len(self.logs)} logs{ends}"

@@ -18,7 +18,7 @@ from lmshealth._private.arrays import BoolArray, FloatArray, diagonal, freeze, o
 from lmshealth._private.result import Result
 from lmshealth._private.tables import TABLES, fact
 from lmshealth.errors import NotEnoughData
-from lmshealth.io.log import Refusal
+from lmshealth.io.log import Refusal, utc_day
 from lmshealth.stage.description import Stage
 from lmshealth.tracking import constants
 from lmshealth.tracking.covariates import regressors
@@ -133,7 +133,7 @@ class Track(Result):
 
     def title(self) -> str:
         """Return machine, number of epochs and events, and the last epoch."""
-        last = f"; modes at {self.recorded_at[-1].date()}" if self.recorded_at else ""
+        last = f"; modes at {utc_day(self.recorded_at[-1])}" if self.recorded_at else ""
         events = f"{len(self.steps)} steps, {len(self.alarms)} alarms"
         return f"Track of {self.stage}: {len(self.logs)} epochs, {events}{last}"
 

@@ -415,6 +415,31 @@ def test_a_run_whose_tables_cannot_be_written_has_announced_nothing(
     assert len(nights.run(N_BEFORE + 3).changes) == 4 and len(nights.delivered()) == 1
 
 
+def test_a_status_has_the_name_of_a_page_whose_machine_is_there(nights: Nights) -> None:
+    """Of machines with the same name of their page, that with a result has the file."""
+    names = "M-1", "M 1"
+    for name, other in (names, names[::-1]):
+        for day in (0, 1):
+            nights.add(name, day)
+            (nights.logs / f"{other}-{day:02d}.csv").unlink(missing_ok=True)
+        nights.run(N_BEFORE)
+        status = json.loads((nights.out / "M-1.status.json").read_text())
+        assert (status["stage"], status["page"]) == (name, "M-1.html")
+
+
+def test_a_limit_of_days_ends_with_the_run_that_has_it(nights: Nights) -> None:
+    """A machine whose logs were removed is silent by the limit of this run, or its own."""
+    nights.run(N_BEFORE + 3)
+    assert all(one["silent"] for one in nights.statuses())
+    for path in nights.logs.iterdir():
+        path.unlink()
+    for given, limit in ((None, 5.0), (30.0, 30.0), (3.0, 3.0)):
+        with pytest.raises(NothingUsable):
+            nights.run(N_BEFORE + 3, silent_days=given)
+        found = [(one["silent"], one["silent_after_days"]) for one in nights.statuses()]
+        assert found == 4 * [(limit == 3.0, limit)]
+
+
 def test_a_clock_that_is_set_back_changes_nothing(nights: Nights) -> None:
     """Silence is that of the day, and is reported once until the next log."""
     nights.run(N_BEFORE + 3)

@@ -12,6 +12,7 @@ from lmshealth._private.serialize import pack
 from lmshealth._private.tables import RUN_TABLES, TABLES
 from lmshealth.batch.assess import pack_assessment
 from lmshealth.batch.run import MachineRecord, machine_output, write_tables
+from lmshealth.errors import BadTable
 from lmshealth.io.log import Refusal
 from lmshealth.report.tables import csv_text, refused_rows
 from tests.assessments import worn
@@ -78,6 +79,14 @@ def test_tables_that_are_not_finished_leave_those_of_before(tmp_path: Path) -> N
         write_tables(tmp_path, ["A", "B"], {"A": effect("roll"), "B": {"effects": b"damaged"}})
     assert [path.name for path in tmp_path.iterdir()] == ["effects.csv"]
     assert (tmp_path / "effects.csv").read_text() == "as it was"
+
+
+def test_a_table_that_cannot_be_written_is_named(tmp_path: Path) -> None:
+    """What is in its place is named, not the file that was to take it, and nothing is left."""
+    (tmp_path / "track.csv").mkdir()
+    with pytest.raises(BadTable, match=r"track\.csv: cannot be written: Is a directory$"):
+        write_tables(tmp_path, [], {})
+    assert not list(tmp_path.glob(".*.part"))
 
 
 @pytest.mark.slow

@@ -361,6 +361,32 @@ def test_pages_come_from_the_store_alone(
     assert repr(again.rows) == repr(done.result.rows)  # NaN stands for a missing limit
 
 
+def test_retired_machines_and_repaired_logs_do_not_come_back(
+    tmp_path: Path, modes_only: Stage
+) -> None:
+    """Pages of a store are those of the last run, which forgot a machine and refused no log."""
+    logs, out, again = write_archive(tmp_path / "logs", 2), tmp_path / "out", tmp_path / "again"
+    gone = write_log(logs / "b.h5", 1.0, 1, stage="other-A")
+    listed = "log-00.h5,test-A\nlog-01.h5,test-A\nb.h5,other-A\n"
+    (logs / "manifest.csv").write_text("file,stage\n" + listed)
+    whole, settings = (logs / "log-01.h5").read_bytes(), Settings(today=date(2024, 1, 15))
+    (logs / "log-01.h5").write_bytes(whole[:1000])
+    assert run(logs, [modes_only], out, settings).n_refused == 1
+    (logs / "log-01.h5").write_bytes(whole)
+    gone.unlink()
+    (logs / "manifest.csv").write_text("file,stage\n" + listed[: listed.index("b.h5")])
+    with closing(sqlite3.connect(out / "lmshealth.sqlite")) as file, file:
+        retire = "WHERE kind = 'announced' AND name = 'other-A'"
+        file.execute(f"DELETE FROM values_{constants.SCHEMA} {retire}")
+    result = run(logs, [modes_only], out, settings)
+    assert (result.n_refused, result.notes) == (0, ())
+    with closing(Store(default_url(out), create=False)) as store:
+        report(store, again, settings)
+    found = pages(again)
+    assert set(found) == {"index.html", "how-to-read.html", "test-A.html"}
+    assert found == {name: (out / name).read_bytes() for name in found}
+
+
 @pytest.mark.slow
 def test_results_do_not_depend_on_the_number_of_workers(done: Done, tmp_path: Path) -> None:
     """Two processes with a fresh store write the same bytes as one."""
@@ -987,6 +1013,21 @@ def test_an_archive_of_bad_logs_only_is_an_error_with_its_reasons_written(
     refused = {row["log"]: row["reason"] for row in rows(tmp_path / "out" / "refused.csv")}
     assert set(refused) == {"broken.h5", "empty.csv", "hollow.csv"}
     assert refused["empty.csv"] == "empty"
+
+
+def test_without_a_usable_log_the_index_is_as_empty_as_the_tables(
+    tmp_path: Path, modes_only: Stage
+) -> None:
+    """The index does not keep the machines of the run before."""
+    logs, out = write_archive(tmp_path / "logs", 1), tmp_path / "out"
+    run(logs, [modes_only], out)
+    assert "test-A" in (out / "index.html").read_text()
+    (logs / "log-00.h5").unlink()
+    with pytest.raises(NothingUsable):
+        run(logs, [modes_only], out)
+    assert rows(out / "modes.csv") == []
+    index = (out / "index.html").read_text()
+    assert "test-A" not in index and "No log belongs to a stage." in index
 
 
 def test_a_table_that_cannot_be_read_is_named_before_the_logs(

@@ -569,20 +569,22 @@ def test_the_earlier_report_is_the_newest_of_another_key(url: str, tmp_path: Pat
 
 
 def test_refused_logs_are_those_of_the_last_run_of_each_machine(url: str, tmp_path: Path) -> None:
-    """A later run replaces what an earlier one refused, where it published the same machines."""
+    """A later run replaces what an earlier one over the same folder refused, and no other."""
     one, two, three = ((Refusal(log, "gap", ""),) for log in ("one", "two", "three"))
     summary = summarise(worn(tmp_path), worn(tmp_path).service())
     with closing(Store(url)) as store:
 
-        def publish(machines: str, refused: tuple[Refusal, ...]) -> tuple[Refusal, ...]:
+        def publish(
+            machines: str, refused: tuple[Refusal, ...], folder: str
+        ) -> tuple[Refusal, ...]:
             for machine in machines:
-                store.publish(machine, ["k1"], summary, store.put_refused(refused))
+                store.publish(machine, ["k1"], summary, store.put_refused(refused, folder))
             return store.refused(one.refused for one in store.published())
 
-        assert publish("ABC", ()) == ()
-        assert publish("AB", one) == one
-        assert publish("C", two) == (*one, *two)
-        assert publish("AB", three) == (*three, *two)
+        assert publish("AB", one, "logs") == one
+        assert publish("C", two, "others") == (*one, *two)
+        assert publish("A", three, "logs") == (*three, *two)
+        assert publish("B", (), "logs") == two
 
 
 @pytest.mark.slow

@@ -12,12 +12,15 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from click.testing import CliRunner
 
 from lmshealth.batch import run as watching
 from lmshealth.batch.database import StoreError
 from lmshealth.batch.ingest import Settings
 from lmshealth.batch.run import RunResult, watch
-from lmshealth.errors import LmshealthError, NothingUsable
+from lmshealth.cli.main import main
+from lmshealth.errors import BadTable, LmshealthError, NothingUsable
+from lmshealth.report import rendering
 from studies.harness.servers import wait_until
 from tests.signals import write_archive_stage, write_log
 
@@ -162,6 +165,27 @@ def test_a_run_that_failed_is_repeated(tmp_path: Path, monkeypatch: pytest.Monke
     with pytest.raises(RuntimeError):
         results.extend(watch(logs, [], tmp_path / "out", Settings(), interval=1.0))
     assert [type(result) for result in results] == [StoreError, StoreError, RunResult]
+
+
+def test_pages_that_cannot_be_written_do_not_end_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Each failure to write a PDF is a line on standard error, after the line of its run."""
+
+    def twice(*_: object, **__: object) -> Iterator[RunResult]:
+        yield from 2 * [RunResult(tmp_path / "index.html", (), {})]
+
+    def fail(_: object) -> None:
+        raise BadTable("A.pdf: cannot be written: Is a directory")
+
+    monkeypatch.setattr(watching, "watch", twice)
+    monkeypatch.setattr(rendering, "write_pdfs", fail)
+    words = ["watch", str(tmp_path), "--stage", "lms-y", "--out", str(tmp_path / "out"), "--pdf"]
+    result = CliRunner().invoke(main, words)
+    assert result.exit_code == 0
+    assert len(result.stdout.splitlines()) == len(result.stderr.splitlines()) == 2
+    assert all(line.endswith("A.pdf: cannot be written: Is a directory")
+               for line in result.stderr.splitlines())  # fmt: skip
 
 
 @pytest.fixture

@@ -22,10 +22,12 @@ from click import Context
 from click.testing import CliRunner, Result
 
 from lmshealth._private.tables import TABLES
+from lmshealth.batch import assess as assessing
 from lmshealth.batch import constants
 from lmshealth.batch.assess import pack_assessment
 from lmshealth.batch.store import Store, default_url
 from lmshealth.cli.main import main
+from lmshealth.errors import LmshealthError
 from lmshealth.io.reading import read_log
 from lmshealth.machine.summary import summarise
 from lmshealth.stage.description import load_stage
@@ -813,6 +815,22 @@ def test_a_run_of_bad_logs_only_is_status_1_with_one_line(
     assert len(result.stderr.splitlines()) == 1
     assert result.stderr.startswith("lmshealth: ")
     assert "broken.h5" in (tmp_path / "out" / "refused.csv").read_text()
+
+
+def test_a_run_in_which_every_machine_failed_is_status_1(
+    stage: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The machine is named once, and the estimates of its logs are in the tables."""
+
+    def fail(*_: object, **__: object) -> None:
+        raise LmshealthError("test-A: cannot be assessed")
+
+    monkeypatch.setattr(assessing, "assess_from", fail)
+    result = run(write_archive(tmp_path / "logs", 1), stage, tmp_path / "out")
+    assert result.exit_code == 1
+    assert result.stderr == "lmshealth: test-A: cannot be assessed\n"
+    rows = list(csv.DictReader((tmp_path / "out" / "modes.csv").read_text().splitlines()))
+    assert [row["mode"] for row in rows] == ["roll", "pitch"]
 
 
 def test_a_log_that_no_description_takes_is_refused(stage: Path, tmp_path: Path) -> None:

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import logging
+from pathlib import Path
+
 import click
 import pytest
-from click.testing import CliRunner
+from click.testing import CliRunner, Result
 
 from lmshealth.cli import options
 from lmshealth.cli.main import main
@@ -101,3 +104,35 @@ def test_what_is_no_name_and_number_is_wrong_usage(value: str) -> None:
     """The error contains the expected form and the input."""
     with pytest.raises(click.BadParameter, match=f"NAME=LOSS.*'{value}'"):
         read_detect("--detect", value)
+
+
+def test_a_log_file_is_no_other_file_of_the_command(tmp_path: Path) -> None:
+    """One that is read or written too is wrong usage, and stays as it is."""
+    table, stage, out = (tmp_path / name for name in ("modes.csv", "my.toml", "track.csv"))
+    for path in (table, stage):
+        path.write_text("as it was")
+
+    def track(log: Path, described: object = "lms-y") -> Result:
+        words = ["track", table, "--stage", described, "--out", out, "--log-file", log]
+        return CliRunner().invoke(main, [str(word) for word in words])
+
+    for log, other in ((table, "the input"), (out, "--log-file"), (stage, "the input")):
+        result = track(log, stage if log == stage else "lms-y")
+        assert result.exit_code == 2
+        assert f"is also {other}; needed is another file" in result.output
+    assert table.read_text() == stage.read_text() == "as it was"
+    assert not out.exists()
+
+
+def test_a_log_file_has_the_error_that_ends_a_command(tmp_path: Path) -> None:
+    """Whether it is of an option or of the work; nothing is logged after the program has ended."""
+    log, table = tmp_path / "log.txt", tmp_path / "empty.csv"
+    table.touch()
+    for *words, name in (
+        ("stage", "none.toml", "none.toml"),
+        ("track", table, "--out", tmp_path / "track.csv", "empty.csv"),
+    ):
+        given = [*words, "--log-file", log]
+        assert CliRunner().invoke(main, [str(word) for word in given]).exit_code == 1
+        assert name in log.read_text().splitlines()[-1]
+        assert logging.getLogger("lmshealth").handlers == []

@@ -553,3 +553,28 @@ def test_many_machines_have_a_row_each(
     assert "22 stages" in text and "2 more stages" in text
     assert max(map(len, text.splitlines())) <= 80
     assert "…" not in text
+
+
+def test_a_step_refers_to_nothing_below_on_a_terminal(
+    make: Callable[..., Assessment], printed: Printed
+) -> None:
+    """The reasons of a machine that needs further logs are on its page only."""
+    print_fleet([nothing(make("C"))])
+    text = printed()
+    assert "Record further logs; the page has the reasons." in text and "below" not in text
+
+
+def test_a_log_that_was_due_is_asked_for_now(
+    make: Callable[..., Assessment], printed: Printed
+) -> None:
+    """A day to inspect that has passed is worded as on the page."""
+    one = summarise(make(), make().service())
+    life, due = one.life, date(2026, 7, 18)
+    assert life is not None
+    service = replace(one.service, kind="by", inspect_by=due)
+    for today, words in (
+        (due, f"Inspect (record a log) by {due}"),
+        (due + timedelta(days=1), f"A log was due by {due}: record one now"),
+    ):
+        print_summaries([replace(one, service=service, today=today)])
+        assert words in printed()

@@ -310,6 +310,21 @@ def test_a_machine_is_silent_by_the_intervals_of_its_own_logs(make: Maker) -> No
     assert limit(moments[:3]) is None
 
 
+def test_a_limit_that_was_asked_for_replaces_no_interval_of_its_own(make: Maker) -> None:
+    """Judged again without the option a machine has its own limit, or none with a single day."""
+    assessment = make()
+    for days, own in ((13, 65.0), (0, None)):
+        moments = (LAST - timedelta(days=days), LAST)
+        history = replace(assessment.history, recorded_at=moments)
+        found = replace(assessment, history=history)
+        made = make_status(found, summarise(found, found.service()))
+        asked = judge_on(made, TODAY, 7.0)
+        assert asked.silent_after_days == 7.0
+        assert judge_on(asked, TODAY, None).silent_after_days == own
+        earlier = msgspec.structs.replace(asked, own_silent_after_days=None)
+        assert judge_on(earlier, TODAY, None).silent_after_days == 7.0
+
+
 def test_a_status_of_an_earlier_schema_is_read_and_written_in_this_one() -> None:
     """What schema 1 had more is left out, and the machine has no change."""
     earlier = msgspec.to_builtins(status()) | {
