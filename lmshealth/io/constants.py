@@ -61,8 +61,8 @@ PREDICTION_ORDER, PREDICTION_SAMPLES = 32, 1000
 # samples than the model reaches.
 LONGEST_FILLED = 16
 # Largest share of the power spectral density that errors of filled samples may have, at any
-# frequency: with 8 % of the samples missing in gaps of 12 (share 0.25) damping ratios are 1 to 2 %
-# low, half of their standard deviation over 40 s (`studies/inputs/outside_faults`).
+# frequency: damping ratios of logs that are just filled are low by 1 %, less than their standard
+# deviation (`studies/inputs/outside_faults`).
 FILLED_ERROR = 0.3
 # Standard deviations of the prediction error up to which samples beside a filled one are ordinary:
 # 10⁹ samples of normal noise stay below 6.2; a blow or a step exceeds it, and is not filled in.

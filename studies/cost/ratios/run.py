@@ -8,7 +8,7 @@ Method
     processes, with all that they start, the peer is the code of the time when it was made. Where
     the time goes: a run with one new log, in one process, under cProfile.
 Run time
-    A quarter of an hour.
+    Half an hour.
 """
 
 from __future__ import annotations
