@@ -9,7 +9,7 @@ from lmshealth._private.arrays import FloatArray, one_thread
 from lmshealth.errors import BadLog
 from lmshealth.io.log import Channel, Log, Refusal
 from lmshealth.modal import constants
-from lmshealth.modal.deterministic.blows import find_hits, from_blows
+from lmshealth.modal.deterministic.blows import find_hits, from_blows, without_rings
 from lmshealth.modal.deterministic.likelihood import least_damping
 from lmshealth.modal.deterministic.measured import MeasuredResponse, from_measured
 from lmshealth.modal.deterministic.periods import find_period
@@ -165,6 +165,10 @@ def _identify(
     """Identify the modes of a response; outliers of its fit are the lines of an ``output``."""
     _check_coherence(log, frf)
     fit = fit_response(ordinates)
+    f, zeta = np.exp(np.split(fit.estimate, 2))
+    cleaned = without_rings(ordinates, f, zeta)
+    if cleaned is not None:
+        fit = fit_response(cleaned)
     if window is not None:
         fit = without_window(fit, window)
     if not (ordinates.scatter or ordinates.transient):

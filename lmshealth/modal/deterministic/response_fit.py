@@ -30,7 +30,7 @@ from lmshealth.modal.modes import paired
 # for elasticity, an odd one for loss.
 FEWEST_POWERS, _MOST_POWERS, _POWER_STEP = 6, 8, 2
 # A transient is smooth over a band: powers of s.
-_TRANSIENT_POWERS = (-1, 0, 1)
+TRANSIENT_POWERS = (-1, 0, 1)
 # Damping ratios at which modes are searched for, and the largest one.
 _TRIED_DAMPING, _MOST_DAMPING = (0.003, 0.01, 0.03, 0.1), 0.7
 # Damping ratio that is left of a mode all of whose damping is that of a window, at most.
@@ -217,7 +217,7 @@ class _State:
 
 def _unknowns(ordinates: Ordinates, theta: FloatArray, powers: Powers) -> int:
     """Count real unknowns."""
-    each, more = (6, len(_TRANSIENT_POWERS)) if ordinates.transient else (4, 0)
+    each, more = (6, len(TRANSIENT_POWERS)) if ordinates.transient else (4, 0)
     return each * theta.size // 2 + powers[1] - powers[0] + 1 + more
 
 
@@ -238,7 +238,7 @@ def _solve(
     kept = size > _THIN * size[0]
     base, background = base[:, kept], columns @ (turn[kept] / size[kept, None]).T
     if ordinates.transient:
-        base = np.hstack([base, stack(s[:, None] ** np.array(_TRANSIENT_POWERS))])
+        base = np.hstack([base, stack(s[:, None] ** np.array(TRANSIENT_POWERS))])
     block = BandSpectra(
         frequency, ordinates.answer[None, :, None], 1 / ordinates.spacing, np.inf, base,
         force=given, transient=ordinates.transient, noise=variance,

@@ -73,6 +73,8 @@ class Ordinates(ReadOnly):
     freedom: float  # complex degrees of freedom of each variance; 0 where it is unknown
     periodic: bool  # means over whole periods or blows: no transient, noise from their scatter
     at_rest: bool = False  # at both ends of the record: no transient
+    # Spectra of the input and of the output of each blow, (2, n_blows, n_lines); else None
+    blows: ComplexArray | None = None
 
     @property
     def transient(self) -> bool:
@@ -92,7 +94,8 @@ class Ordinates(ReadOnly):
     def only(self, keep: BoolArray) -> Self:
         """Keep some of the lines."""
         lines = ("frequency", "given", "answer", "noise")
-        return replace(self, **{name: getattr(self, name)[keep] for name in lines})
+        blows = None if self.blows is None else self.blows[:, :, keep]
+        return replace(self, **{name: getattr(self, name)[keep] for name in lines}, blows=blows)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
