@@ -337,9 +337,16 @@ class _Command(click.Command):
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
         """Require that each output is a file of its own, then begin the log in its file."""
+        words = list(args)
         try:
             left = super().parse_args(ctx, args)
         except LmshealthError:  # such as of a description: the log has it too
+            log = ctx.meta.get(_LOG)
+            # Words behind that of the error are not parsed, and may name the same file.
+            files = [Path(word.removeprefix("--log-file=")).resolve() for word in words]
+            if log and files.count(log.resolve()) > 1:
+                detail = f"{log} is also the input; needed is another file"
+                raise click.BadParameter(detail, ctx, param_hint="--log-file") from None
             self._begin_log(ctx)
             raise
         self._begin_log(ctx)

@@ -154,15 +154,16 @@ def _steady(velocity: FloatArray, lag: int, scale: float) -> BoolArray:
 
 
 def _on_slow_ramp(velocity: FloatArray, lag: int, scale: float) -> BoolArray:
-    """Return which samples have other velocities both ``lag`` samples before and after.
+    """Return which samples have a lower velocity ``lag`` samples before and a higher one after.
 
-    Where one of the two is beyond the ends, the other counts.
+    Or the other way round: on both sides of a short plateau it is lower.
     """
     most = constants.SAME_VELOCITY * max(scale, 1e-12)
-    change = np.abs(velocity[lag:] - velocity[:-lag]) > most
-    before, after = np.ones((2, velocity.size), dtype=bool)
-    before[lag:], after[:-lag] = change, change
-    return np.asarray(before & after)
+    change = velocity[lag:] - velocity[:-lag]
+    slow = np.zeros(velocity.size, dtype=bool)
+    for risen in (change > most, change < -most):
+        slow[lag:-lag] |= risen[:-lag] & risen[lag:]
+    return slow
 
 
 def _range_of_position(log: Log, velocity: Samples) -> float:

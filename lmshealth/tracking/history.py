@@ -27,6 +27,8 @@ StepKind = Literal["step", "regreasing", "servo", "sensor", "reset"]
 # Order of the series of one mode.
 _SOURCES = ("joint", "acc", "frf", "delta_e")
 _KINDS: dict[str, StepKind] = {"regrease": "regreasing", "servo": "servo", "sensor": "sensor"}
+# Cost of an estimate that gets no name, above all distances within the searches together.
+_NO_NAME = 1e3
 EXCITATION = "excitation_db"
 """Covariate that the identification measures: needed where frequencies depend on the amplitude."""
 
@@ -414,24 +416,29 @@ def _estimates(ordered: Sequence[LogEstimates], stage: Stage | None) -> list[Est
 def _tracked(modes: Modes, tracked: Sequence[ModeSpec]) -> dict[int, str]:
     """Return the indices of the estimates that may be of tracked modes, with their names.
 
-    One without a name gets that of the nearest mode, if its search holds it and no other estimate
-    of the log by the same source has that name.
+    Those without a name in the search of a mode are assigned to the modes that no other estimate of
+    the log by the same source has, one to one and as near as possible together; one that is nearest
+    to a mode with an estimate stays without a name.
     """
-    known = {mode.name for mode in tracked}
+    known = [mode.name for mode in tracked]
     found = {i: name for i, name in enumerate(modes.names) if name in known}
-    near = []
-    for i, frequency in enumerate(modes.frequency.tolist()):
-        off = [
-            (float(abs(search_offset(frequency, mode.frequency_hz, mode.search))), i, mode.name)
-            for mode in tracked
-        ]
-        held = [one for one in off if one[0] <= 1]
-        near += [min(held)] if held and not modes.names[i] else []
-    taken = {(modes.sources[i], name) for i, name in found.items()}
-    for _, i, name in sorted(near):
-        own = modes.sources[i], name
-        found[i] = "" if own in taken else name
-        taken.add(own)
+    unnamed = [i for i, name in enumerate(modes.names) if not name]
+    if not unnamed or not tracked:
+        return found
+    from scipy.optimize import linear_sum_assignment  # late: most logs have names
+
+    described, search = np.array([(mode.frequency_hz, mode.search) for mode in tracked]).T
+    off = np.abs(search_offset(modes.frequency[:, None], described, search))
+    for source in dict.fromkeys(modes.sources):
+        own = [i for i in unnamed if modes.sources[i] == source and off[i].min() <= 1]
+        found |= dict.fromkeys(own, "")
+        taken = {name for i, name in found.items() if name and modes.sources[i] == source}
+        is_free = np.array([name not in taken for name in known])
+        open_ = [i for i in own if is_free[off[i].argmin()]]
+        cost = np.where(is_free & (off[open_] <= 1), off[open_], _NO_NAME)
+        for row, column in zip(*linear_sum_assignment(cost), strict=True):
+            if cost[row, column] < _NO_NAME:
+                found[open_[row]] = known[column]
     return found
 
 
@@ -448,8 +455,8 @@ def _undescribed(
             if label.mode is not None and label.mode not in modes:
                 f = float(np.exp(ln_f))
                 detail = (
-                    f"a resonance at {f:.5g} Hz is none of the described modes, and lies in the "
-                    "search of one: describe it, or correct the description"
+                    f"a resonance at {f:.5g} Hz is not clearly any described mode: describe it, or "
+                    "correct the description"
                 )
                 refused.append(
                     Refusal(

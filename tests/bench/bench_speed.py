@@ -140,10 +140,10 @@ def test_tracking(race: Race) -> None:
     2 s were asked for, 3.9 times; 4.2 times is what the study claims.
     """
     life = long_life(10_000, 5)
-    ticks = StateSpace(life, None).ticks
+    space = StateSpace(life, None)
     race(
         lambda: track(life) and None,
-        lambda: filterpy_loop(life, one_setting(), ticks) and None,
+        lambda: filterpy_loop(space, one_setting()) and None,
         name="tracking 10,000 epochs of five modes",
         beside="a loop over filterpy, one setting",
         at_most=4.5,

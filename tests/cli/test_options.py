@@ -120,6 +120,9 @@ def test_a_log_file_is_no_other_file_of_the_command(tmp_path: Path) -> None:
         result = track(log, stage if log == stage else "lms-y")
         assert result.exit_code == 2
         assert f"is also {other}; needed is another file" in result.output
+    # An error of the description ends the command before it knows its other files.
+    words = ["track", "--stage", stage, "--log-file", table, "--out", out, table]
+    assert CliRunner().invoke(main, [str(word) for word in words]).exit_code == 2
     assert table.read_text() == stage.read_text() == "as it was"
     assert not out.exists()
 

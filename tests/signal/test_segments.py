@@ -69,6 +69,18 @@ def test_a_slow_ramp_is_no_constant_velocity(seconds: float) -> None:
     assert nominal_velocity(log) == pytest.approx(0.1, rel=2e-3)
 
 
+@pytest.mark.parametrize("seconds", [0.08, 0.15, 0.25])
+def test_a_short_plateau_is_of_constant_velocity(seconds: float) -> None:
+    """Between two ramps the velocity is lower before and after: that is no ramp."""
+    ramp, top = np.linspace(0, 0.2, 100), np.full(round(seconds * 2000), 0.2)
+    strokes = np.tile(np.concatenate([ramp, top, ramp[::-1], np.zeros(400)]), 10)
+    log = make_log({"acc_a": np.zeros(strokes.size)}, 2000.0, velocity=strokes)
+    found = select_segments(log, "constant")
+    assert len(found) == 10
+    assert all(s.stop - s.start == pytest.approx(top.size, abs=50) for s in found)
+    assert nominal_velocity(log) == pytest.approx(0.2)
+
+
 def test_a_set_point_that_trembles_is_at_rest() -> None:
     """A position within 1 µm is no move, whatever its velocities are; a move of 10 µm is one."""
     rng = np.random.default_rng(4)

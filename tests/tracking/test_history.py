@@ -14,7 +14,7 @@ import pytest
 from lmshealth.errors import NotEnoughData
 from lmshealth.io.log import WARNINGS, Refusal
 from lmshealth.modal.log_estimates import LogEstimates
-from lmshealth.stage.description import Stage
+from lmshealth.stage.description import Stage, load_stage
 from lmshealth.tracking.contradictions import sort_by_time
 from lmshealth.tracking.history import (
     History,
@@ -301,10 +301,30 @@ def test_a_name_is_given_once(stage: Stage) -> None:
     reasons = [one.reason for one in refused]
     assert reasons == ["unconfirmed"] * 2 + ["undescribed"] * 4
     assert {one.mode for one in refused[2:]} == {"132.2 Hz"}
-    # Without a name both may be the mode: the nearer one is.
+    # Without any name the lower one is roll, which both together are nearest to.
     unnamed = [replace(r, modes=replace(r.modes, names=("", ""))) for r in alike]
     history, _ = build_history(unnamed, stage)
-    np.testing.assert_allclose(history.ln_frequency[:, 0], pitch)
+    assert history.modes == ("roll", "pitch")
+    np.testing.assert_allclose(history.ln_frequency, np.tile([beside, pitch], (6, 1)))
+
+
+@pytest.mark.parametrize(
+    ("frequencies", "names"),
+    [
+        ((120.0, 130.0, 146.0), ("", "", "")),
+        ((131.5, 142.0, 161.0), ("", "", "")),
+        ((121.3, 131.1, 148.8), ("", "", "yaw")),
+    ],
+)
+def test_modes_that_moved_together_get_their_names(
+    frequencies: tuple[float, ...], names: tuple[str, ...]
+) -> None:
+    """Estimates without a name are assigned together: the nearest mode may be another's."""
+    made = make_reading("0", 0, 0.0, dict(zip("abc", np.log(frequencies), strict=True)))
+    reading = replace(made, modes=replace(made.modes, names=names))
+    history, refused = build_history([reading], load_stage("lms-y"))
+    assert history.modes == ("roll", "pitch", "yaw") and refused == []
+    np.testing.assert_allclose(np.exp(history.ln_frequency[0]), frequencies)
 
 
 def test_the_first_declared_baseline_counts(stage: Stage) -> None:

@@ -470,8 +470,11 @@ class SinceFirst:
 def _day_first(dates: Iterable[str]) -> bool | None:
     """Return whether short dates begin with the day; None where none shows it."""
     parts = [re.split("[/-]", date) for date in dates]
-    # The first number of a date like 26-01-05 may be its year.
-    if any(int(first) > 12 and len(year) == 4 for first, _, year in parts):
+    # The first number of a date like 26-01-05 may be its year. No record lasts for one: what differs
+    # between dates with the same last number is the day.
+    firsts, lasts = {first for first, *_ in parts}, {last for *_, last in parts}
+    of_days = len(firsts) > len(lasts) == 1
+    if any(int(first) > 12 and (of_days or len(year) == 4) for first, _, year in parts):
         return True
     return False if any(int(second) > 12 for _, second, _ in parts) else None
 
@@ -507,7 +510,7 @@ def _check_no_ticks(name: str, time: Samples, unit: float) -> None:
     is_today = _UNIX_TIMES[0] <= start / scale + epoch < _UNIX_TIMES[1]
     if is_today and scale / step >= _LEAST_TICK_RATE:
         found = f"{1 / (step * unit):.6g} Hz, or {scale / step:.6g} Hz as times in {what}"
-        cure = "map it to time_s for the second, state sample_rate_hz for the first"
+        cure = "map it to time_s for the second, or state sample_rate_hz in the file or the map"
         raise Unusable("time", f"{name} gives {found} {SINCE_EPOCH}; {cure}")
 
 

@@ -16,6 +16,7 @@ from lmshealth.stage.description import Stage, load_stage
 from lmshealth.tracking.constants import (
     BIAS_STD,
     DAMPING_WALK,
+    KNOWN_RATE_LOGS,
     LOGS_PER_LIFE,
     RATE_COMMON,
     SETTLING_LOGS,
@@ -85,7 +86,7 @@ def draw(rng: np.random.Generator, sources: tuple[str, ...] = ("acc",)) -> Life:
     missing = rng.random((n, r)) < 0.1
     missing[0] = False
     seen = np.asarray(~missing.all(axis=1))
-    level, damping = _walk(rng, chosen, _ticks(travel, seen))
+    level, damping = _walk(rng, chosen, *_ticks(travel, seen))
     temperature, effect = _temperature(rng, n)
     mode = np.tile(np.arange(m), len(sources))
     bias = rng.standard_normal((2, r)) * np.array(BIAS_STD)[:, None]
@@ -107,14 +108,17 @@ def draw(rng: np.random.Generator, sources: tuple[str, ...] = ("acc",)) -> Life:
     return Life(history, chosen, level, damping)
 
 
-def _walk(rng: np.random.Generator, chosen: Hyperparameters, ticks: Array) -> tuple[Array, Array]:
+def _walk(
+    rng: np.random.Generator, chosen: Hyperparameters, ticks: Array, longer: Array
+) -> tuple[Array, Array]:
     """Let both modes wander: ln f and ln ζ, ``(n_logs, n_modes)`` each."""
     m = len(MODES)
     rate = chosen.rate_std * _together(rng, RATE_COMMON)
     decay = float(chosen.rate_decay[0])
     level, damping = [LEVEL], [DAMPING]
     settled = np.exp(-np.cumsum(np.r_[0.0, ticks]) * LOGS_PER_LIFE / SETTLING_LOGS)
-    for tick, settling in zip(ticks, -np.diff(settled), strict=True):
+    for tick, more, settling in zip(ticks, longer, -np.diff(settled), strict=True):
+        rate = more * rate
         # The integral of a walk, and the walk itself, over one tick.
         bend = chosen.rate_walk * np.sqrt(tick) * _together(rng, RATE_COMMON)
         rest = chosen.rate_walk * np.sqrt(tick**3 / 12) * _together(rng, RATE_COMMON)
@@ -127,14 +131,18 @@ def _walk(rng: np.random.Generator, chosen: Hyperparameters, ticks: Array) -> tu
     return np.array(level), np.array(damping)
 
 
-def _ticks(travel: Array, seen: NDArray[np.bool_]) -> Array:
-    """Return the parts of a life between logs; the unit is their mean distance so far."""
-    ticks, before, count = [], 0.0, 0
+def _ticks(travel: Array, seen: NDArray[np.bool_]) -> tuple[Array, Array]:
+    """Return the parts of a life between logs, and by how much the life of the latter is longer.
+
+    The unit is their mean distance so far; from the tenth on rates keep their value if it changes.
+    """
+    ticks, longer, before, count, mean = [], [], 0.0, 0, 1.0
     for s, there in zip(travel[1:] - travel[0], seen[1:], strict=True):
-        count += int(there)
+        known, count = count >= KNOWN_RATE_LOGS and there, count + int(there)
         ticks.append((s - before) * count / s / LOGS_PER_LIFE if there else 0.0)
-        before = s if there else before
-    return np.array(ticks)
+        longer.append(s / count / mean if known else 1.0)
+        before, mean = (s, s / count) if there else (before, mean)
+    return np.array(ticks), np.array(longer)
 
 
 def _together(rng: np.random.Generator, common: float) -> Array:

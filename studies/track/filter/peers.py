@@ -23,7 +23,6 @@ from lmshealth.tracking.constants import (
     SETTLING_LOGS,
     WANDER_COMMON,
 )
-from lmshealth.tracking.covariates import Regressor
 from lmshealth.tracking.filters.state_space import Hyperparameters, StateSpace
 from lmshealth.tracking.history import History
 from lmshealth.tracking.track import track
@@ -45,10 +44,12 @@ class Loop(NamedTuple):
     drift_std: Array
 
 
-def filterpy_loop(
-    history: History, setting: Hyperparameters, ticks: Array, regressed: tuple[Regressor, ...] = ()
-) -> Loop:
-    """Filter one setting by filterpy: [ln f, rate, ln ζ, baseline, wander, coefficients]."""
+def filterpy_loop(space: StateSpace, setting: Hyperparameters) -> Loop:
+    """Filter one setting by filterpy: [ln f, rate, ln ζ, baseline, wander, coefficients].
+
+    Of the state space are the history, its regressors, and the parts of a life between its logs.
+    """
+    history, ticks, longer, regressed = space.history, space.ticks, space.longer, space.regressed
     m, n = len(history.modes), len(history.logs)
     level, rate, damping, base, own = (slice(part * m, (part + 1) * m) for part in range(5))
     size = (5 + len(regressed)) * m
@@ -72,8 +73,8 @@ def filterpy_loop(
     for k, tick in enumerate(ticks):
         f, q = np.eye(size), np.zeros((size, size))
         bend = setting.rate_walk[0] ** 2 * alike
-        f[level, rate] = (-np.expm1(-decay * tick) / decay if decay else tick) * eye
-        f[rate, rate] = np.exp(-decay * tick) * eye
+        f[level, rate] = longer[k] * (-np.expm1(-decay * tick) / decay if decay else tick) * eye
+        f[rate, rate] = longer[k] * np.exp(-decay * tick) * eye
         q[level, level] = setting.level_walk[0] ** 2 * tick * eye + bend * tick**3 / 3
         q[level, level] += settling[k] * alike
         q[level, rate] = q[rate, level] = bend * tick**2 / 2
@@ -113,7 +114,7 @@ def deviation(rng: np.random.Generator, n: int, machine: Stage) -> dict[str, flo
     for _ in range(n):
         life = draw(rng)
         found, space = filtered(life, machine), StateSpace(life.history, machine)
-        book = filterpy_loop(life.history, life.setting, space.ticks, space.regressed)
+        book = filterpy_loop(space, life.setting)
         std = np.sqrt(np.einsum("kii->ki", found.cov["ln f"]))
         # Drifts of machines that hardly wander have next to no std, but numbers of ln f.
         wide = np.maximum(book.drift_std, 0.1 * std)
@@ -212,11 +213,11 @@ def speed(n: int, m: int, repeats: int) -> Row:
     history = long_life(n, m)
     # The other programs take modes for independent: so do ours here.
     with patch.object(constants, "RATE_COMMON", 0.0):
-        ticks = StateSpace(history, None).ticks
+        space = StateSpace(history, None)
         mean, std = bank_of_one(history)
         there = {name: work for name, work in PEERS.items() if find_spec(name)}
         others: dict[str, Callable[[], tuple[Array, Array]]] = {
-            LOOP: lambda: filterpy_loop(history, one_setting(), ticks)[:2],
+            LOOP: lambda: filterpy_loop(space, one_setting())[:2],
             **{name: partial(work, history) for name, work in there.items()},
         }
         works = {
