@@ -470,8 +470,8 @@ class SinceFirst:
 def _day_first(dates: Iterable[str]) -> bool | None:
     """Return whether short dates begin with the day; None where none shows it."""
     parts = [re.split("[/-]", date) for date in dates]
-    # The first number of a date like 26-01-05 may be its year. No record lasts for one: what differs
-    # between dates with the same last number is the day.
+    # The first number of a date like 26-01-05 may be its year. No record lasts for one: what
+    # differs between dates with the same last number is the day.
     firsts, lasts = {first for first, *_ in parts}, {last for *_, last in parts}
     of_days = len(firsts) > len(lasts) == 1
     if any(int(first) > 12 and (of_days or len(year) == 4) for first, _, year in parts):
