@@ -238,7 +238,7 @@ def track(history: History, stage: Stage | None = None) -> Track:
     >>> std = np.sqrt(np.diag(track.drift_cov[-1]))
     >>> for mode, drift, off in zip(track.modes, track.drift[-1], std):
     ...     print(f"{mode}: {drift:.1%} ± {off:.1%}")
-    roll: -6.0% ± 0.4%
+    roll: -6.0% ± 0.3%
     pitch: -5.7% ± 0.3%
     yaw: -6.1% ± 0.3%
     >>> [(event.kind, f"{track.recorded_at[event.epoch]:%d %B}") for event in track.events]
