@@ -120,29 +120,32 @@ def lives(history: History) -> FloatArray:
     return np.array(gone, dtype=np.longdouble)
 
 
-def longer(history: History, k: int) -> float:
-    """Give by how much a life of log k is longer than one of the log before, and a rate larger."""
-    n = np.count_nonzero(np.isfinite(history.ln_frequency[1:k]).any(axis=1))
-    before, now = distances(history)[k - 1 : k + 1]
-    return now / before if n >= KNOWN_RATE_LOGS and now and before else 1.0
+def longer(history: History) -> list[float]:
+    """Give by how much a life of each log is longer than one of the log before: so are rates."""
+    means, found = distances(history), [1.0]
+    for k in range(1, len(means)):
+        n = np.count_nonzero(np.isfinite(history.ln_frequency[1:k]).any(axis=1))
+        known = n >= KNOWN_RATE_LOGS and means[k] and means[k - 1]
+        found.append(means[k] / means[k - 1] if known else 1.0)
+    return found
 
 
-def by_rate(history: History, wander: Wander, start: int) -> np.ndarray:
+def by_rate(t: FloatArray, more: Sequence[float], wander: Wander, start: int) -> np.ndarray:
     """Give the change of ln f at each log per rate at a log, which is per life of that log."""
-    t, moved, rate = lives(history), np.zeros(len(history.logs), dtype=np.longdouble), 1.0
+    moved, rate = np.zeros(t.size, dtype=np.longdouble), 1.0
     for k in range(start + 1, moved.size):
-        rate *= longer(history, k)
+        rate *= more[k]
         moved[k] = moved[k - 1] + rate * wander.moved(t[k] - t[k - 1])
         rate *= float(np.exp(-wander.decay * (t[k] - t[k - 1])))
     return moved
 
 
-def bent(history: History) -> np.ndarray:
+def bent(t: FloatArray, more: Sequence[float]) -> np.ndarray:
     """Give the covariance of ln f by a random walk of rates of variance 1 per life, ``(n, n)``."""
-    t, n = lives(history), len(history.logs)
+    n, steady = t.size, Wander(0.0, 0.0, 0.0, {})
     total = np.zeros((n, n), dtype=np.longdouble)
     for j in range(1, n):  # what begins between two logs goes on with the rate that it has then
-        tick, since = t[j] - t[j - 1], by_rate(history, Wander(0.0, 0.0, 0.0, {}), j)
+        tick, since = t[j] - t[j - 1], by_rate(t, more, steady, j)
         there = (np.arange(n) >= j).astype(np.longdouble)
         total += tick**3 / 3 * np.outer(there, there) + tick * np.outer(since, since)
         total += tick**2 / 2 * (np.outer(there, since) + np.outer(since, there))
@@ -210,6 +213,7 @@ class Textbook:
 
     def __init__(self, history: History, wander: Wander, known: Known) -> None:
         self.history, self.wander, self.known = history, wander, known
+        self.longer = longer(history)
         parts = ("level", "rate", "damping", "base", "wander")
         self.names: list[tuple[object, ...]] = [(p, i) for i in history.modes for p in parts]
         for name, _, _, curvature in known.covariates:
@@ -262,7 +266,7 @@ class Textbook:
             tick = float(gone[k] - gone[k - 1])
             level, rate, own = self.all("level"), self.all("rate"), self.all("wander")
             # A rate is that per life of the log before.
-            more = longer(history, k)
+            more = self.longer[k]
             far = more * float(wander.moved(np.array(tick)))
             left = more * np.exp(-wander.decay * tick)
             # A rate that is unknown anew is so from the log before on.
@@ -386,15 +390,15 @@ def _levels(history: History, wander: Wander, known: Known) -> list[np.ndarray]:
     With t the lives since the first log, and c the change by a rate, that of ln f is
     σ² + σ_r² c c' + walk min(t, t') + bend + Σ jump² where both come after it.
     """
-    t = lives(history)
-    low, moved = np.minimum.outer(t, t), by_rate(history, wander, 0)
-    rates = wander.rate**2 * np.outer(moved, moved) + wander.bend**2 * bent(history)
+    t, more = lives(history), longer(history)
+    low, moved = np.minimum.outer(t, t), by_rate(t, more, wander, 0)
+    rates = wander.rate**2 * np.outer(moved, moved) + wander.bend**2 * bent(t, more)
     settled = wander.settled(history)
     rates += np.minimum.outer(settled, settled)
     level = LEVEL_STD**2 + wander.level**2 * low
     damping = DAMPING_STD**2 + DAMPING_WALK**2 * low
     for k in known.reopened:
-        since = by_rate(history, wander, k - 1)
+        since = by_rate(t, more, wander, k - 1)
         rates += wander.rate**2 * np.outer(since, since)
     for step in history.steps:
         if step.kind in ("step", "regreasing", "reset"):
