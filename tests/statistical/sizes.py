@@ -28,10 +28,10 @@ TESTS = {
     # Identification.
     "test_intervals_from_one_record_cover": Part(200, _both("one record")),
     "test_intervals_from_short_moves_cover": Part(150, _both("short moves")),
-    "test_intervals_from_means_over_parts_cover": Part(150, _both("parts"), control=110),
+    "test_intervals_from_means_over_parts_cover": Part(150, _both("parts"), control=100),
     "test_intervals_of_three_modes_in_three_channels_cover": Part(50, _both("three modes")),
     "test_intervals_cover_where_floors_share_the_force": Part(150, _both("common floor")),
-    "test_intervals_of_joint_sources_cover": Part(300, _both("joint sources")),
+    "test_intervals_of_joint_sources_cover": Part(300, _both("joint sources"), control=150),
     "test_intervals_from_stops_cover": Part(300, _both("stops")),
     "test_intervals_from_whole_periods_cover": Part(150, _both("whole periods")),
     "test_intervals_from_driven_records_cover": Part(60, _both("records")),
