@@ -20,7 +20,7 @@ from lmshealth.io.manifest import (
 from lmshealth.io.reading import read_log
 from lmshealth.machine.assessment import Assessment, assess, expect_settings
 from lmshealth.modal.identification import identify
-from lmshealth.modal.log_estimates import LogEstimates
+from lmshealth.modal.log_estimates import LogEstimates, without_copies
 from lmshealth.signal.readings import loop_error
 from lmshealth.stage.description import Stage, expect_stage, why_unmatched
 from lmshealth.tracking.maintenance import (
@@ -96,6 +96,8 @@ def analyse(
             machine = log.metadata.stage if isinstance(log, Log) else overrides.get("stage")
             refusal = Refusal(error.log, error.reason, error.detail, baseline=is_declared)
             refused.append(replace(refusal, machine=machine or ""))
+    found, copies = without_copies(found)
+    refused += copies
     if not found:
         why = "; ".join(f"{one.log}: {one.detail}" for one in refused[:3]) or "none is given"
         raise NotEnoughData(f"no log can be used: {why}")

@@ -4,7 +4,7 @@ import logging
 import math
 import os
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Container, Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field, replace
 from datetime import date, datetime
@@ -26,7 +26,7 @@ from lmshealth.io.log import SHIPPED, Metadata, Refusal, covariates, is_future
 from lmshealth.io.manifest import NOT_LOGS, Manifest, copy_error, find_logs, name_of, read_manifest
 from lmshealth.io.reading import content_digest, read_log, require_identity
 from lmshealth.io.refusal import visible
-from lmshealth.modal.log_estimates import LogEstimates
+from lmshealth.modal.log_estimates import LogEstimates, without_copies
 from lmshealth.report.language import LANGUAGES, Language
 from lmshealth.stage.description import Stage, why_unmatched
 
@@ -133,15 +133,19 @@ class _Outcome(NamedTuple):
     description: str
     machine: str | None
     refused: tuple[Refusal, ...]  # of the log as a whole
+    recording: str = ""  # fingerprint of machine, moment and odometer
     packed: bytes | None = None  # by the worker, if it is to be stored
 
     @classmethod
     def of(cls, task: _Task, found: Identified, *, is_new: bool) -> Self:
         """Make it from an outcome."""
-        refused = () if isinstance(found.outcome, LogEstimates) else found.outcome
+        refused, recording = found.outcome, ""
+        if isinstance(found.outcome, LogEstimates):
+            own, refused = found.outcome.metadata, ()
+            recording = fingerprint(own.stage, own.recorded_at, own.travel)
         key = task.key(found.description)
         packed = pack(found) if is_new and found.lasting else None
-        return cls((task.name, key), found.description, found.stage, refused, packed)
+        return cls((task.name, key), found.description, found.stage, refused, recording, packed)
 
 
 def ingest(
@@ -160,15 +164,9 @@ def ingest(
     logs = (path for path in archive.logs if path not in settings.growing)
     found = [path for path in logs if inside not in path.resolve().parents]
     tasks, refused = _tasks(folder, found, manifest, settings.columns, resources)
-    copies = {one.log for one in refused if one.reason == "duplicate"}
-    unlisted = (name_of(path, folder) for path in found if manifest.omits(path))
-    refused += [
-        Refusal(name, "not-listed", "it is read with its own metadata; add a row")
-        for name in unlisted
-        if name not in copies
-    ]
     # By machine and description; only names and keys are kept, not the estimates.
     groups: dict[str, dict[str, list[LogKey]]] = {}
+    recordings: dict[str, list[LogKey]] = {}
     lost: list[Refusal] = []
     # Machine of each log, by the manifest or its own metadata.
     owners = {name_of(path, folder): row.get("stage") for path, row in manifest.rows.items()}
@@ -190,9 +188,21 @@ def ingest(
             if not one.refused:
                 own = groups.setdefault(str(one.machine), {})
                 own.setdefault(one.description, []).append(one.key)
+                recordings.setdefault(one.recording, []).append(one.key)
         n_cached += 0 if is_new else len(part)
         done += len(part)
         progress("identifying", done, len(tasks))
+    unlisted = {name_of(path, folder) for path in found if manifest.omits(path)}
+    refused += _copies(recordings, unlisted, store)
+    copies = {one.log for one in refused if one.reason == "duplicate"}
+    groups = {
+        machine: {by: [key for key in own if key[0] not in copies] for by, own in each.items()}
+        for machine, each in groups.items()
+    }
+    refused += [
+        Refusal(name, "not-listed", "it is read with its own metadata; add a row")
+        for name in sorted(unlisted - copies)
+    ]
     names = {name_of(path, folder) for path in found}
     names |= {one.log for one in (*archive.refused, *manifest.refused)}
     machines, others = _grouped(groups, stages)
@@ -207,6 +217,20 @@ def ingest(
         logs=frozenset(name for name in names if PurePosixPath(name).name not in NOT_LOGS),
         n_cached=n_cached,
     )
+
+
+def _copies(
+    recordings: Mapping[str, Sequence[LogKey]], unlisted: Container[str], store: Store
+) -> list[Refusal]:
+    """Refuse logs that are the recording of another file; of several a listed one is analysed."""
+    refused = []
+    for keys in (own for own in recordings.values() if len(own) > 1):
+        order = sorted(keys, key=lambda key: (key[0] in unlisted, key[0]))
+        known = dict(store.of_keys("identified", (key for _, key in order)))
+        found = [(log, unpack_or_none(known.get(key), Identified)) for log, key in order]
+        outcomes = [own.renamed(log).outcome for log, own in found if own is not None]
+        refused += without_copies([one for one in outcomes if isinstance(one, LogEstimates)])[1]
+    return refused
 
 
 def _grouped(

@@ -584,7 +584,13 @@ _Files = dict[Path, tuple[int, int]]
 
 
 def watch(
-    folder: Path, stages: Sequence[Stage], out: Path, settings: Settings, *, interval: float
+    folder: Path,
+    stages: Sequence[Stage],
+    out: Path,
+    settings: Settings,
+    *,
+    interval: float,
+    progress: Progress = lambda step, done, total: None,
 ) -> Iterator[RunResult | LmshealthError]:
     """Yield the result of `run`, or its error, whenever it has something to do; never end.
 
@@ -608,7 +614,7 @@ def watch(
         if settled and not is_half and (new or today != day):
             result: RunResult | LmshealthError
             try:
-                result = run(folder, stages, out, replace(settings, growing=growing))
+                result = run(folder, stages, out, replace(settings, growing=growing), progress)
             except LmshealthError as error:
                 result = error
             # A store that is away may be back at the next poll; without new logs none is usable.

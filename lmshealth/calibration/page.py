@@ -140,7 +140,8 @@ def render_page(
 
 def verdict_of(check: CalibrationCheck) -> tuple[str, str, list[str]]:
     """Return state, headline and reasons of a check, for page and terminal."""
-    drawn = f"{sum(one.drawn for one in check.outcomes)} lives drawn from the description"
+    n_drawn = sum(one.drawn for one in check.outcomes)
+    drawn = f"{n_drawn} {'life' if n_drawn == 1 else 'lives'} drawn from the description"
     family = (
         f"{len(check.p_values)} checks are held to {percent(constants.FALSE_VERDICT)} together: at "
         "most so often a right program is called wrong."

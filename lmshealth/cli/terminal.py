@@ -322,6 +322,12 @@ def short_names(rows: Sequence[Row], others: Sequence[Row] = ()) -> list[Row]:
     return [row | {"log": names[row["log"]]} for row in rows]
 
 
+def log_progress(what: str, done: int, total: int) -> None:
+    """Write the begin, the end and each tenth of a step to the log."""
+    if done in (0, total) or done % max(total // 10, 1) == 0:
+        _logger.info("%s: %d of %d", what, done, total)
+
+
 class _Bars(progress.Progress):
     """Progress bars that appear at a time of the monotonic clock, whether or not work goes on."""
 
@@ -352,8 +358,7 @@ def progress_bars(delay: float = 0.0) -> Iterator[Any]:
         tasks: dict[str, Any] = {}
 
         def report(what: str, done: int, total: int) -> None:
-            if done in (0, total) or done % max(total // 10, 1) == 0:
-                _logger.info("%s: %d of %d", what, done, total)
+            log_progress(what, done, total)
             if what not in tasks:
                 tasks[what] = bars.add_task(what, total=total, completed=done)
             bars.update(tasks[what], completed=done, total=total)

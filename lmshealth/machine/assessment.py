@@ -6,14 +6,16 @@ Everything here is a function of its arguments: no store, no file, no process, n
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from datetime import date
-from itertools import compress, takewhile
+from itertools import compress, pairwise, takewhile
 
 import numpy as np
 from numpy.linalg import LinAlgError
 
-from lmshealth._private.serialize import fingerprint, seed_of
+from lmshealth._private.arrays import FloatArray
+from lmshealth._private.serialize import fingerprint, seed_of, stream
 from lmshealth._private.tables import fact
 from lmshealth.errors import BadQuestion, LmshealthError, NotEnoughData
 from lmshealth.io.log import Notice, Refusal, utc_day
@@ -46,6 +48,7 @@ from lmshealth.tracking.history import (
 )
 from lmshealth.tracking.maintenance import (
     NO_MAINTENANCE,
+    RESETS,
     Maintenance,
     baseline_notices,
     maintenance_notices,
@@ -59,6 +62,8 @@ from lmshealth.tracking.track import (
     track,
 )
 
+_CARRIED_STEP = 1 << 23  # of the random stream
+_LEAST_HEALTH = 1e-3  # that is carried: less is past every limit
 _NAMELESS = ("ambiguous", "unconfirmed")  # reasons of estimates whose name is not certain
 
 
@@ -88,6 +93,9 @@ class Assessment:
     # Lives before the present baseline, and what those of the fleet support; None with too few.
     ended: tuple[fleet_prior.EndedLife, ...] = ()
     calibration: fleet_prior.Calibration | None = None
+    # Draws of ln health at the present baseline, over that at commissioning, of what no work has
+    # restored, ``(n, n_parameters)``; None where nothing is lost.
+    carried: FloatArray | None = None
     doubt: str = ""  # why names of modes, odometer or dates are in doubt; then there is no health
     today: date | None = None  # day of its status; None for that of the last log
     lost: tuple[Refusal, ...] = ()  # its logs that were refused as a whole, without estimates
@@ -324,7 +332,7 @@ def assess_from(
         return made, None
     try:
         accepted = accepted_estimates(history, tracked, doubtful=True)
-        return _with_results(made, accepted, epochs, before)
+        return _with_results(made, accepted, work, epochs, before)
     except LmshealthError as error:
         why = str(error)
     except LinAlgError as error:  # one machine must not end the run
@@ -375,12 +383,15 @@ class LifeState:
     start: LifeStart  # draws of its posterior
     n_logs: int
     verdict: str
-    past: str  # fingerprint of the logs before the baseline, and the lives that ended with them
+    # Fingerprint of the logs before the baseline, the lives that ended with them, and what these
+    # have left, as in `Assessment`.
+    past: str
     ended: tuple[fleet_prior.EndedLife, ...]
+    carried: FloatArray | None
 
 
 def _with_results(
-    made: Assessment, history: History, epochs: int, before: LifeState | None
+    made: Assessment, history: History, work: Maintenance, epochs: int, before: LifeState | None
 ) -> tuple[Assessment, LifeState]:
     """Add what follows from the posterior of the life of accepted estimates.
 
@@ -389,10 +400,15 @@ def _with_results(
     """
     stage, every = made.stage, constants.EMCEE_EVERY
     seed = seed_of(made.seed, history.stage, stage.digest)
-    past = _past(made)
+    past = _past(made, work)
     if before is not None and before.past != past:  # draws of another life are no start of this
         before = None
-    ended = fleet_prior.ended_lives(history, stage, seed) if before is None else before.ended
+    if before is None:
+        ended = fleet_prior.ended_lives(history, stage, seed)
+        carried = _carried(history, stage, work, seed)
+    else:
+        ended, carried = before.ended, before.carried
+    made = replace(made, carried=carried)
     chains = before is None or len(history.logs) // every > before.n_logs // every
     start = None if before is None else before.start
     life = fit_life(history, stage, seed, chains=chains, before=start)
@@ -402,21 +418,51 @@ def _with_results(
         found = _with_life(made, life, history, epochs)
     found = replace(found, ended=ended, evidence=fleet_prior.machine_evidence(stage, life))
     n_logs, verdict = len(history.logs), found.judgement.verdict
-    return found, LifeState(life.start, n_logs, verdict, past, ended)
+    return found, LifeState(life.start, n_logs, verdict, past, ended, carried)
 
 
-def _past(made: Assessment) -> str:
+def _carried(
+    history: History, stage: Stage, work: Maintenance, seed: tuple[int, ...]
+) -> FloatArray | None:
+    """Draw what lives before the present baseline have left, as `Assessment.carried`.
+
+    Work restores the parameters that `restored` names; a baseline that is declared without work
+    begins anew. Of a life with too few logs nothing is known, and nothing is carried.
+    """
+    words = {one.name: one.word for one in stage.parameters}
+    rng = np.random.default_rng(stream(seed, _CARRIED_STEP))
+    left, moments = np.zeros((constants.N_DRAWS, len(words))), history.recorded_at
+    resets = [step.first for step in history.steps if step.kind == "reset"]
+    for begin, after in pairwise(history.baselines):
+        end = next((first for first in resets if begin < first <= after), None)
+        if end is None:
+            left[:] = 0.0
+            continue
+        done = {a.action for a in work.actions if moments[end - 1] < a.recorded_at <= moments[end]}
+        with suppress(LmshealthError, LinAlgError):
+            life = fit_life(history.first_logs(end), stage, seed, chains=False)
+            draws = np.log(np.maximum(life.health, _LEAST_HEALTH)).reshape(-1, len(words))
+            left += rng.choice(draws, len(left))
+        again = restored(words, done)
+        left[:, [name in again for name in words]] = 0.0
+    return left if left.any() else None
+
+
+def _past(made: Assessment, work: Maintenance) -> str:
     """Return the fingerprint of all that is known of the logs before the baseline."""
     own, n = made.history, made.history.baseline
     stated = {name: values[:n] for name, values in own.covariates.items()}
     rows = own.recorded_at[:n], own.travel[:n], own.ln_frequency[:n], own.cov[:n]
     steps = [(step.kind, step.first, step.source) for step in own.steps if step.first < n]
-    return fingerprint(own.logs[:n], made.digests[:n], rows, stated, own.baselines, steps)
+    done = [(one.recorded_at, one.action) for one in work.actions if one.action in RESETS]
+    return fingerprint(own.logs[:n], made.digests[:n], rows, stated, own.baselines, steps, done)
 
 
 def _with_life(made: Assessment, life: LifePosterior, history: History, epochs: int) -> Assessment:
     """Add what follows from the draws of a life: health, remaining life and verdict."""
     stage, prognosis, notices = made.stage, None, made.notices
+    if made.carried is not None:
+        life = life.carrying(made.carried)
     health = health_of(life, history, stage, epochs_to_publish(history, stage, epochs))
     if parameters_with_limit(stage):
         try:

@@ -317,7 +317,11 @@ def make_status(assessment: Assessment, summary: Summary) -> Status:
     track, life, service = assessment.track, summary.life, summary.service
     alarms = undeclared_events(track, assessment.history.baseline, "alarm")
     shown = [one for one in summary.health if one.determined]
-    reached = [one.below_limit for one in shown if one.limit is not None]
+    # A limit that later work has restored is reached no more.
+    limited = (
+        one for one in shown if one.limit is not None and one.name not in assessment.restored
+    )
+    reached = [one.below_limit for one in limited]
     reached += [life.any.already_past] if life else []
     health = [
         {
@@ -481,7 +485,9 @@ def _ended(before: Status, now: Status, today: date) -> Iterator[tuple[str, str]
     elif _is_worked_on(before, now):
         if _is_near(now.service_by, today):  # without a verdict it is no condition, and still due
             ended -= {"service-due"}
-        yield from ((code, "work was entered") for code in (*_ENDING, *_ONCE) if code in ended)
+        is_more = (now.works or 0) > (before.works or 0)
+        why = "work was entered" if is_more else "maintenance.csv was changed"
+        yield from ((code, why) for code in (*_ENDING, *_ONCE) if code in ended)
 
 
 def _was_silent(before: Status | None) -> bool:

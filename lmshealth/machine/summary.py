@@ -138,7 +138,10 @@ def _class_of(assessment: Assessment) -> str:
         alone = {one.mode for one in lone if one.probability >= LONE_NAMED}
         moved = {one.mode for one in events} | set(assessment.alarmed)
         return "outside" if events and moved <= alone else "alarm"
-    known = {OUTSIDE_MAP: "outside", "healthy": "healthy", **dict.fromkeys(NO_HEALTH, "open")}
+    known = {OUTSIDE_MAP: "outside", **dict.fromkeys(NO_HEALTH, "open")}
+    # Without parameters no alarm is all that logs can show.
+    sound = ("healthy",) if assessment.stage.parameters else ("healthy", "no-alarm")
+    known |= dict.fromkeys(sound, "healthy")
     found = known.get(verdict, "loss")
     if assessment.drifted or (assessment.left_out and found in ("healthy", "open")):
         return "drift"

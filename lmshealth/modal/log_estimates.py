@@ -1,8 +1,11 @@
 """Everything that is identified in one log."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
-from lmshealth.io.log import Metadata
+import numpy as np
+
+from lmshealth.io.log import Metadata, Refusal
 from lmshealth.modal.mode_shapes import ModeShapes
 from lmshealth.modal.modes import Modes
 from lmshealth.modal.spectra_summary import SpectraSummary
@@ -55,3 +58,38 @@ class LogEstimates:
     spectra: SpectraSummary | None = None
     shapes: ModeShapes | None = None
     sample_rate: float | None = None
+
+
+# Estimates of one recording that was stored in two forms agree to this part of their standard
+# deviations; those of two recordings do once in 180 for each number, and that at one moment.
+_EQUAL = 0.01
+
+
+def without_copies(
+    logs: Sequence[LogEstimates],
+) -> tuple[list[LogEstimates], list[Refusal]]:
+    """Return logs of which no two are one recording, and the refusals of the others.
+
+    Another format, attribute or rounding makes another file of a recording. It is of one machine,
+    moment and odometer, and has equal estimates: a day without a time may have several logs.
+    """
+    kept, refused = list[LogEstimates](), list[Refusal]()
+    by_moment: dict[object, list[LogEstimates]] = {}
+    for log in logs:
+        own = log.metadata
+        before = by_moment.setdefault((own.stage, own.recorded_at, own.travel), [])
+        first = next((one for one in before if _are_equal(one.modes, log.modes)), None)
+        if first is None or own.recorded_at is None:
+            kept.append(log)
+            before.append(log)
+            continue
+        detail = f"same recording as {first.log}, which is analysed for both"
+        refused.append(Refusal(log.log, "duplicate", detail, machine=own.stage or ""))
+    return kept, refused
+
+
+def _are_equal(one: Modes, other: Modes) -> bool:
+    if not one.names or one.names != other.names:
+        return False
+    off = np.abs(one.estimate - other.estimate)
+    return bool((off <= _EQUAL * np.sqrt(np.diag(one.cov))).all())

@@ -255,7 +255,9 @@ def plot_life(ax: Axes, prognosis: Prognosis, parameter: str, *, baseline: float
     end = now + prognosis.horizon / _KM
     low, middle, high = np.array(quantiles(prognosis.remaining[:, column], LEVELS)) / _KM
     if np.isfinite(low) and low < prognosis.horizon / _KM:
-        _passage(ax, now, np.array([low, middle, high]), 100 * limit)
+        ahead = np.array([low, middle, high])
+        ahead[ahead > end - now] = np.inf  # nothing is claimed there
+        _passage(ax, now, ahead, 100 * limit)
     right = min(end, now + max(1.3 * high, 0.25 * now)) if np.isfinite(high) else end
     if shown := right >= 0.55 * end:
         right = end
@@ -350,8 +352,10 @@ def _passage(ax: Axes, now: float, ahead: FloatArray, level: float) -> None:
     names = tr("Early (5 %)"), tr("Median"), tr("Late (95 %)")
     for x, far, name in zip(where, ahead, names, strict=True):
         if np.isfinite(x):
-            ahead_, at = text.km(_KM * far), text.whole_km(_KM * x)
-            hint = tr("{name}: in {ahead}, at {odometer}", name=name, ahead=ahead_, odometer=at)
+            left, at = text.km(_KM * far), text.whole_km(_KM * x)
+            hint = tr("{name}: in {ahead}, at {odometer}", name=name, ahead=left, odometer=at)
+            if far <= 0:
+                hint = f"{name}: {tr('already passed')}"
             hints(ax, np.array([x]), np.array([level]), [hint])
 
 

@@ -400,7 +400,8 @@ def next_step(step: NextStep) -> str:
     by = "" if step.by is None else day(step.by)
     if step.kind == "check-loss":
         by = tr("now") if step.case[1] == "now" else tr("by {day}", day=by)
-    days, horizon = min(step.log_every, 182), km(step.horizon)
+    # To a tenth of a day: a rate of usage gives no whole days.
+    days, horizon = min(step.log_every + 0.1, 182), km(step.horizon)
     often = tr("a log every {n} weeks", n=int(days // 7))
     if days < 14:
         often = tr("a log every {n} days", n=int(days))
@@ -457,7 +458,7 @@ def changes(before: Summary, now: Summary) -> Iterator[str]:
                 life=f"{middle[1]}{spread}",
             )
     if before.service.by is not None or now.service.by is not None:
-        yield _service_change(before.service.by, now.service.by)
+        yield _service_change(before.service, now.service)
     more, travel = now.n_logs - before.n_logs, now.travel - before.travel
     logs = count(abs(more), "log")
     if more:
@@ -486,14 +487,19 @@ def _health_changes(before: Summary, now: Summary) -> Iterator[str]:
         yield f"{capitalize(spell(name))}: {' → '.join(medians)}{spread}."
 
 
-def _service_change(before: date | None, now: date | None) -> str:
+def _service_change(before: Service, now: Service) -> str:
     shift = ""
-    if before and now and before != now:
-        n = (now - before).days
+    # A service that is due now has the day of its log.
+    dated = before.kind != "now" and now.kind != "now"
+    if dated and before.by and now.by and before.by != now.by:
+        n = (now.by - before.by).days
         days = count(abs(n), "day")
         shift = tr(", {days} later", days=days) if n > 0 else tr(", {days} earlier", days=days)
-    days_ = [day(one) if one else tr("none") for one in (before, now)]
-    return tr("Service date: {change}.", change=f"{_from_to(*days_)}{shift}")
+    words = [
+        tr("now") if one.kind == "now" else day(one.by) if one.by else tr("none")
+        for one in (before, now)
+    ]
+    return tr("Service date: {change}.", change=f"{_from_to(*words)}{shift}")
 
 
 def _from_to(before: str, now: str) -> str:

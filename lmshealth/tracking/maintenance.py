@@ -13,7 +13,7 @@ from lmshealth._private.tables import fact
 from lmshealth.errors import BadTable
 from lmshealth.io.log import Notice, Refusal, expect_moment, parse_moment, parse_name
 from lmshealth.io.manifest import Row, find_sheets, name_of, read_sheet
-from lmshealth.io.refusal import Unusable, shown
+from lmshealth.io.refusal import Unusable, listed, shown
 
 _FILE = "maintenance.csv"
 _NEEDED = ("stage", "recorded_at", "action")
@@ -71,8 +71,9 @@ NO_MAINTENANCE = Maintenance()
 def without_logs(actions: Iterable[Action], machines: Collection[str]) -> Iterator[str]:
     """Yield a sentence on each machine of actions that is none of these: it may be misspelt."""
     for name in dict.fromkeys(one.stage for one in actions if one.stage not in machines):
-        near = get_close_matches(name, machines, 1)
-        hint = f"; is it {near[0]}?" if near else ""
+        written = {one.casefold(): one for one in machines}
+        near = get_close_matches(name.casefold(), written, 1)
+        hint = f"; is it {written[near[0]]}?" if near else ""
         yield f"maintenance.csv: work on {name} is not used: no usable log is of it{hint}"
 
 
@@ -126,7 +127,9 @@ def _read(tables: Iterable[tuple[Path, str]], latest: datetime | None) -> Mainte
                     unread.append(UnreadableRow(refusal, _machine(row)))
         except Unusable as error:
             unread.append(UnreadableRow(Refusal(name, error.reason, error.detail), None))
-    return Maintenance(tuple(sorted(actions, key=lambda a: a.recorded_at)), tuple(unread))
+    # A row that is there twice is one work.
+    ordered = dict.fromkeys(sorted(actions, key=lambda a: a.recorded_at))
+    return Maintenance(tuple(ordered), tuple(unread))
 
 
 def _action(row: Row, latest: datetime | None) -> Action:
@@ -135,7 +138,7 @@ def _action(row: Row, latest: datetime | None) -> Action:
         raise Unusable("bad-row", row.trouble)
     if row.cells["action"] not in (known := (*RESETS, *STEPS)):
         raise Unusable(
-            "bad-row", f"action {row.cells['action'][:80]!r} is unknown; known are {list(known)}"
+            "bad-row", f"action {row.cells['action'][:80]!r} is unknown; known are {listed(known)}"
         )
     stage, moment = parse_name(row.cells, "stage"), parse_moment(row.cells, latest)
     if stage is None or moment is None:
@@ -207,8 +210,10 @@ def maintenance_notices(work: Maintenance, moments: Sequence[datetime | None]) -
             notices.append(Notice("no-log-since", "caution", action.action, what, to_do))
         elif before:
             what = fact(
-                "{work} on {day} opened a new baseline: fractions are relative to the state after "
-                "it, and earlier logs ({n}) only inform the effects of temperature, load and loop.",
+                "{work} on {day} opened a new baseline: fractions of what it restores are relative "
+                "to the state after it, those of other parts to a baseline before. Earlier logs "
+                "({n}) inform the effects of temperature, load and loop, and what other parts had "
+                "lost.",
                 **done,
                 n=before,
             )

@@ -9,16 +9,18 @@ from typing import Any
 import numpy as np
 import pytest
 
+from lmshealth import examples
 from lmshealth._private.serialize import pack, unpack
 from lmshealth.calibration.lives import make_history
 from lmshealth.errors import NotEnoughData
 from lmshealth.life import constants
 from lmshealth.life.posterior.fit import LifePosterior, fit_life
+from lmshealth.life.prognosis import prognosis_of
 from lmshealth.machine import assessment as assessing
 from lmshealth.machine.assessment import Assessment, LifeState
 from lmshealth.modal.log_estimates import LogEstimates
-from lmshealth.stage.description import Stage
-from lmshealth.tracking.history import Series
+from lmshealth.stage.description import Stage, load_stage
+from lmshealth.tracking.history import Series, build_history
 from lmshealth.tracking.maintenance import NO_MAINTENANCE, Action, Maintenance
 from lmshealth.tracking.track import track
 from tests.lives import FADING, FREQUENCY, LAWS_ALONE, make_reading, make_stage, true_drift
@@ -183,3 +185,47 @@ def test_a_mode_that_moves_alone_is_the_verdict(tmp_path: Path) -> None:
     assert found.judgement.probability > 0.9
     assert "Yaw has moved by −2.0" in found.judgement.why
     assert found.service().kind != "now"
+
+
+def test_work_on_one_part_keeps_the_loss_of_the_other(fits: list[tuple[bool, bool]]) -> None:
+    """Fractions of what was not restored are of commissioning: the example ends at a preload of 72 %.
+
+    Control: after work on the guide they are of the state after it, and the mount keeps its loss.
+    """
+    logs, stage = examples.readings(), load_stage("lms-y")
+    machine, at = str(logs[0].metadata.stage), logs[12].metadata.recorded_at
+    assert at is not None
+    names = [one.name for one in stage.parameters]
+    preload, mount = names.index("guide_preload"), names.index("mount_stiffness")
+    found = {}
+    for action in ("mount-tightened", "preload-adjust"):
+        work = Maintenance((Action(machine, at, action),))
+        made, after = assessing.assess_from(logs, stage, work, epochs=5, seed=0)
+        assert made.history.baseline == 12
+        assert made.carried is not None
+        assert made.health is not None
+        assert after is not None
+        found[action] = made.carried, made.health
+        # The next assessment takes over what is carried.
+        n_fits = len(fits)
+        again, _ = assessing.assess_from(logs, stage, work, epochs=5, seed=0, before=after)
+        assert len(fits) - n_fits == 1
+        assert again.carried is made.carried
+    (left, tightened), (kept, adjusted) = found["mount-tightened"], found["preload-adjust"]
+    assert (left[:, mount] == 0).all()
+    assert (kept[:, preload] == 0).all()
+    assert np.median(kept[:, mount]) < -0.03
+    low, high = (tightened.latest(level)[preload] for level in (0.05, 0.95))
+    assert low < 0.72 < high
+    assert adjusted.latest(0.05)[preload] > 0.72
+
+
+def test_a_loss_that_is_carried_may_be_past_the_limit(stage: Stage) -> None:
+    """Half of the preload was lost before the baseline: below the limit, whatever came since."""
+    history, logs = build_history(readings(20), stage)[0], np.log(np.full((10, 1), 0.5))
+    life = fit_life(history, stage, 0, chains=False)
+    before, after = (prognosis_of(one, history, stage) for one in (life, life.carrying(logs)))
+    assert before.already_past()[-1] == 0
+    assert after.already_past()[-1] == 1
+    np.testing.assert_allclose(after.health, before.health / 2)
+    np.testing.assert_allclose(after.curve_quantiles, before.curve_quantiles / 2, rtol=0.05)

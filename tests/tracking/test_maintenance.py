@@ -148,7 +148,7 @@ def test_work_on_guide_or_mount_opens_a_new_baseline(action: str) -> None:
     notes = maintenance_notices(Maintenance((done(action, 2),)), MOMENTS)
     assert len(notes) == 1
     assert action in notes[0].what
-    assert "earlier logs (2)" in notes[0].what
+    assert "Earlier logs (2)" in notes[0].what
 
 
 def test_a_reset_without_later_logs_says_so() -> None:

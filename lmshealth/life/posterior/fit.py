@@ -31,7 +31,7 @@ from lmshealth.tracking.history import History
 if TYPE_CHECKING:
     from xarray import DataTree
 
-_STEP = 1 << 20  # of the random stream
+_STEP, _CARRIED_STEP = 1 << 20, 1 << 22  # of the random streams
 _N_SETTINGS, _N_LONE, _N_PRIOR = 500, 50, 2000
 _N_KEPT = constants.N_DRAWS // constants.N_ENSEMBLES  # draws of each ensemble
 
@@ -120,10 +120,24 @@ class LifePosterior:
     judge_ratio: FloatArray
     start: LifeStart  # of the next posterior
     seed: tuple[int, ...]
+    # Draws of ln health at the baseline, shape of `health`, where lives before it have left some
+    # loss: `health` and `off` contain it, so that fractions are of a baseline before these lives.
+    carried: FloatArray | None = None
 
     def __post_init__(self) -> None:
         shape, p = self.health.shape, len(self.parameters)
         freeze(self, ("health off rate", *shape[:2], p), ("lone", *shape[:2]))
+
+    def carrying(self, ln_health: FloatArray) -> LifePosterior:
+        """Return the posterior of a life that begins with losses, of which there are draws.
+
+        Their shape is ``(n, n_parameters)``; those of a life and of the lives before it are
+        independent.
+        """
+        rng = np.random.default_rng(stream(self.seed, _CARRIED_STEP))
+        carried = rng.choice(ln_health, self.health.shape[:2])
+        health = self.health * np.exp(carried)
+        return replace(self, health=health, off=self.off + carried, carried=carried)
 
     @property
     def stage(self) -> str:
@@ -161,7 +175,8 @@ class LifePosterior:
             health = one.health_by_laws(moments) * np.exp(off)
             shape = (self.health.shape[0], one.n_mixture_draws, *health.shape[1:])
             parts.append(health.reshape(shape))
-        return np.moveaxis(np.concatenate(parts, axis=1), 2, 0)
+        found = np.moveaxis(np.concatenate(parts, axis=1), 2, 0)
+        return found if self.carried is None else found * np.exp(self.carried)
 
     def prior_at(self, moments: FloatArray, rng: np.random.Generator) -> FloatArray:
         """Draw ln health at moments from the prior, ``(n_moments, n, n_parameters)``.
@@ -180,7 +195,10 @@ class LifePosterior:
             parts.append(x[inside] - data.stage.baseline_point)
         x = np.moveaxis(np.concatenate(parts), 1, 0)
         share = np.sqrt(np.maximum(moments, 0.0) / data.now * spread)[:, None, None]
-        return np.asarray(x + share * data.free * rng.standard_normal(x.shape))
+        x = np.asarray(x + share * data.free * rng.standard_normal(x.shape))
+        if self.carried is None:
+            return x
+        return x + rng.choice(self.carried.reshape(-1, x.shape[-1]), x.shape[1])
 
     def laws(self, parameter: str) -> dict[tuple[str, float], float]:
         """Return the probability of each law of a parameter by its kind and begin in m."""

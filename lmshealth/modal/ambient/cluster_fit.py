@@ -51,6 +51,8 @@ _MOST_SLOPES = 400_000
 _DOUBTFUL = 200.0
 # Shift by a coloured force, in standard deviations, from which on that for a white one counts.
 _FAR = 4.0
+# Change of ln ζ from the joint model of the band beyond which parts in quadrature are not believed.
+_OTHER_DAMPING = 0.5
 # The bins of a first fit resolve this part of the median bandwidth.
 _FINER = 2.0
 # Bins made for an expected bandwidth suffice for one that is narrower by this factor.
@@ -483,14 +485,18 @@ def _solve(
     )
     p = likelihood.minimise(start)
     if data.out_of_phase and not likelihood.collapsed(p) and _is_out_of_phase(likelihood, p):
-        likelihood = likelihood.with_quadrature()
-        lay = likelihood.layout
+        wider = likelihood.with_quadrature()
+        lay = wider.layout
         begin = lay.shapes.start + lay.shape_in_phase
-        start = likelihood.start.copy()
+        start = wider.start.copy()
         start[begin : lay.shapes.stop] = [own.imag[c, i] / scale[i] for c, i in layout.shape]
-        p = min(
-            (likelihood.minimise(one) for one in (start, layout.extended(p))), key=likelihood.value
-        )
+        q = min((wider.minimise(one) for one in (start, layout.extended(p))), key=wider.value)
+        # Parts in quadrature may explain what is no mode by a pole of another damping than that of
+        # all channels and modes together.
+        m = len(targets)
+        moved = [float(np.abs(one[m : 2 * m] - np.log(zeta)).max()) for one in (p, q)]
+        if moved[1] < max(_OTHER_DAMPING, moved[0]):
+            likelihood, p = wider, q
     return _Optimum(targets, likelihood, p, likelihood.data_value(p), near, bandwidth)
 
 
@@ -549,7 +555,8 @@ def _conclude(data: ClusterData, optimum: _Optimum, expected: list[ComplexArray]
     seen = shapes @ data.basis.T  # in units of the noise, (n_modes, n_channels)
     clear = ratio if data.basis.shape[1] == data.unit.size else np.abs(seen.T)
     observed = data.spectra.spectra, data.masks, expected
-    unsteady = [unsteadiness(*observed, *one) for one in zip(f, zeta, shapes, strict=True)]
+    moved = (f, zeta), likelihood.forces(p), shapes
+    unsteady = [unsteadiness(*observed, *moved, i) for i in range(n)]
     # Squares of the ordinates near a mode are correlated where its excitation is not steady.
     wider = np.sqrt([one.expected for one in unsteady] * 2)
     strength = likelihood.strength(p).sum(axis=0) / np.sum(np.abs(shapes) ** 2, axis=1)

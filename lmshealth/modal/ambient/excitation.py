@@ -61,15 +61,18 @@ def unsteadiness(
     spectra: Sequence[CrossSpectrum],
     masks: Sequence[BoolArray],
     expected: Sequence[ComplexArray],
-    f: float,
-    zeta: float,
-    shape: FloatArray | ComplexArray,
+    modes: tuple[FloatArray, FloatArray],
+    forces: FloatArray | ComplexArray,
+    shapes: FloatArray | ComplexArray,
+    i: int,
 ) -> Unsteadiness:
-    """Compute the unsteadiness of the force of a mode from its kurtosis; 1 for a steady force.
+    """Compute the unsteadiness of the force of mode i from its kurtosis; 1 for a steady force.
 
-    ``masks`` hold the ordinates without lines, ``expected`` the expectation of each spectrum, and
-    ``shape`` the mode, ``(n_channels,)``.
+    ``masks`` hold the ordinates without lines, ``expected`` the expectation of each spectrum;
+    ``modes`` are f in Hz and ζ of all modes of the fit, ``forces`` the covariance of their forces,
+    ``(n_modes, n_modes)``, and ``shapes`` are ``(n_modes, n_channels)``.
     """
+    f, zeta = (own[i] for own in modes)
     fourth = square = total = 0.0
     n = 0
     for spectrum, mask, e in zip(spectra, masks, expected, strict=True):
@@ -77,13 +80,11 @@ def unsteadiness(
         if not near.any():
             continue
         place = np.flatnonzero(near)
-        # The force as the channels show it best, h* φᵀ E⁻¹ F, at twice the rate of its band.
-        weight = (
-            response(np.asarray(f), np.asarray(zeta), spectrum.frequency[near])[:, None]
-            * np.linalg.solve(
-                e[near], np.broadcast_to(shape[:, None], (place.size, shape.size, 1))
-            )[:, :, 0]
-        )
+        # The force given all channels, Σ_j S_ij h_j* φ_jᴴ E⁻¹ F: without the other modes, which
+        # forces in common move, only what these leave would remain. At twice the rate of its band.
+        h = response(*(own[:, None] for own in modes), spectrum.frequency[near])
+        seen = np.einsum("j,jk,jc->kc", forces[i].conj(), h, shapes)
+        weight = np.linalg.solve(e[near], seen[..., None])[..., 0]
         size = 2 * (place[-1] + 1 - place[0])
         force = np.zeros((len(spectrum.transforms), size), dtype=complex)
         force[:, place - place[0]] = np.sum(spectrum.transforms[:, near] * weight.conj(), axis=2)

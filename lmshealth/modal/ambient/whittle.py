@@ -317,6 +317,11 @@ class Likelihood:
         """PSD of each modal force in each channel, shape ``(n_channels, n_modes)``."""
         return self._at_modes(p).strength
 
+    def forces(self, p: FloatArray) -> ComplexArray | FloatArray:
+        """Covariance of the modal forces, shape ``(n_modes, n_modes)``."""
+        m = self.layout.n_modes
+        return self._at_modes(p).forces[:m, :m]
+
     def signal_to_noise(self, p: FloatArray) -> FloatArray:
         """Modal signal-to-noise ratios S φ² / (4 ζ² N), shape ``(n_channels, n_modes)``."""
         m, point = self.layout.n_modes, self._at_modes(p)
@@ -408,7 +413,7 @@ class _Point:
         driven, force = lay.places[1]
         np.add.at(self._root, (driven, force), lay.units[0] * self._scale[driven] * p[lay.forces])
         self._phi = np.concatenate([likelihood.shapes(p), np.eye(lay.n_channels)], axis=1)
-        self._s = np.asarray(self._root @ self._root.conj().T)
+        self.forces = np.asarray(self._root @ self._root.conj().T)  # S, of modes and floors
         f, zeta = np.exp(p[: 2 * m].reshape(2, m, 1))
         modes = receptance(f, zeta, block.grid)
         modes[0] += p[2 * m : 3 * m, None]
@@ -428,7 +433,7 @@ class _Point:
     def strength(self) -> FloatArray:
         """PSD of each modal force in each channel, shape ``(channels, modes)``."""
         m = self._layout.n_modes
-        return np.asarray(np.abs(self._phi[:, :m]) ** 2 * np.diag(self._s)[:m].real)
+        return np.asarray(np.abs(self._phi[:, :m]) ** 2 * np.diag(self.forces)[:m].real)
 
     @property
     def floor(self) -> FloatArray:
@@ -441,7 +446,7 @@ class _Point:
     def _modal(self) -> ComplexArray:
         """D, shape ``(components, components, n)``."""
         h = self._h[0]
-        modal = self._block.smear(self._s[..., None] * h[:, None] * h[None].conj())
+        modal = self._block.smear(self.forces[..., None] * h[:, None] * h[None].conj())
         return modal * self._gain if self._layout.n_bumps else modal
 
     @cached_property
@@ -496,7 +501,7 @@ class _Point:
         Returns the index of b in the basis and the row w of each unknown, E_a = b (Φ̄ w)ᵀ + adjoint,
         shapes ``(unknowns,)`` and ``(unknowns, components, n)``.
         """
-        lay, h, s = self._layout, self._h, self._s
+        lay, h, s = self._layout, self._h, self.forces
         (pole, slope), (driven, _), (channel, mode) = lay.places
         by_pole = s[pole, :, None] * h[slope, pole][:, None] * h[0].conj()
         pairs = self._block.smear(h[0][:, None] * h[0].conj())
@@ -550,7 +555,7 @@ class _Point:
         """Add the part of two unknowns of h: Q = Σ_ij S_ij B_ji h_i h_j*."""
         h, n = self._h, self._layout.n_poles
         component, slope = self._layout.places[0]
-        weight = self._s[..., None] * turned
+        weight = self.forces[..., None] * turned
         first = h[slope, component]
         pairs = weight[component[:, None], component]
         term = np.einsum("abk,ak,bk->ab", pairs, first, first.conj())

@@ -55,7 +55,52 @@ def measured(log: Log, n_parts: int = 1) -> Unsteadiness:
         for s in spectra
     ]
     masks = [s.free for s in spectra]
-    return unsteadiness(spectra, masks, expected, MODE.frequency, MODE.damping, shape)
+    poles = np.array([MODE.frequency]), np.array([MODE.damping])
+    return unsteadiness(spectra, masks, expected, poles, np.eye(1), shape[None], 0)
+
+
+THREE = [
+    Mode(90.0, 0.015, shape=(1.0, 0.4, -0.3)),
+    Mode(100.0, 0.015, shape=(0.3, 1.0, 0.5)),
+    Mode(112.0, 0.015, shape=(-0.4, 0.2, 1.0)),
+]
+
+
+def of_one_force(seed: int, intensity: np.ndarray, forces: np.ndarray, noise: float) -> list[float]:
+    """Measure the ratios of three modes that one force moves, in a record cut out of a longer one.
+
+    ``forces`` is the covariance of their forces by which the force of each is estimated.
+    """
+    rng, n = np.random.default_rng(seed), intensity.size
+    more = np.concatenate([np.ones(n // 2), intensity, np.ones(n // 2)])
+    force = np.fft.rfft(white(rng, 1.0, more.size, RATE) * np.sqrt(more))
+    frequency = np.fft.rfftfreq(more.size, 1 / RATE)
+    moved = [np.fft.irfft(force * mode.response(frequency)) for mode in THREE]
+    shapes = np.array([mode.shape for mode in THREE])
+    rows = (shapes.T @ moved)[:, n // 2 : n // 2 + n]
+    log = make_log(
+        {f"acc_{k}": row + white(rng, noise, n, RATE) for k, row in enumerate(rows)}, RATE
+    )
+    (spectrum,) = cross_spectra(log.channels, [Segment(0, n, float("nan"))], RATE, 150.0)
+    seen = shapes.T @ [mode.response(spectrum.frequency) for mode in THREE]
+    expected = noise * np.eye(3) + np.einsum("ck,dk->kcd", seen, seen.conj())
+    poles = np.array([[mode.frequency, mode.damping] for mode in THREE]).T
+    given = [spectrum], [spectrum.free], [expected], (poles[0], poles[1]), forces, shapes
+    return [unsteadiness(*given, i).ratio for i in range(3)]
+
+
+@pytest.mark.parametrize("noise", [1.0, 1e-4])
+def test_modes_that_one_force_moves_have_its_intensity(noise: float) -> None:
+    """Also where channels without noise show the ends of the record, and what the modes leave.
+
+    Control: what the other modes do not explain of a steady force is far from steady.
+    """
+    same = np.ones((3, 3))
+    assert max(of_one_force(1, np.ones(24_000), same, noise)) < 1.3
+    shaken = of_one_force(2, bursts(0.3), same, noise)
+    assert np.abs(0.3 * np.array(shaken) - 1).max() < 0.25
+    alone = of_one_force(1, np.ones(24_000), np.eye(3), noise)
+    assert noise == 1.0 or max(alone) > 3.0
 
 
 @pytest.mark.parametrize("n_parts", [1, 6])
