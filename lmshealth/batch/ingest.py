@@ -139,10 +139,12 @@ class _Outcome(NamedTuple):
     @classmethod
     def of(cls, task: _Task, found: Identified, *, is_new: bool) -> Self:
         """Make it from an outcome."""
-        refused, recording = found.outcome, ""
+        refused, recording = tuple[Refusal, ...](), ""
         if isinstance(found.outcome, LogEstimates):
-            own, refused = found.outcome.metadata, ()
+            own = found.outcome.metadata
             recording = fingerprint(own.stage, own.recorded_at, own.travel)
+        else:
+            refused = found.outcome
         key = task.key(found.description)
         packed = pack(found) if is_new and found.lasting else None
         return cls((task.name, key), found.description, found.stage, refused, recording, packed)

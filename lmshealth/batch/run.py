@@ -281,7 +281,8 @@ def run(
             tables[""] = {name: pack(csv_text(name, own)) for name, own in of_run.items()}
             write_tables(out, [machine.name for machine in machines], tables)
         with in_language(settings.language):
-            write_index(out, rows, refused, today=judging.today)
+            gone = [one for one in statuses if one.stage not in ingested.machines]
+            write_index(out, rows, refused, today=judging.today, gone=gone)
         unsent = deliver(store, statuses, settings.alerts, out)
         write_statuses(statuses, made, out)
         notes += [*store.notes, *without_logs(work.actions, ingested.machines)]

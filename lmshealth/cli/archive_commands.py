@@ -153,7 +153,7 @@ def watch(logs: Path, stages: tuple[Stage, ...], out: Path, interval: float, **g
     from lmshealth.batch.run import watch as watch_folder
 
     pdf, style = given.pop("pdf"), given.pop("style")
-    how = {"interval": interval, "progress": terminal.log_progress}
+    how: Any = {"interval": interval, "progress": terminal.log_progress}
     for result in watch_folder(logs, stages, out, _settings(given), **how):
         now = f"{datetime.now().astimezone().isoformat(timespec='seconds')} "
         if isinstance(result, LmshealthError):

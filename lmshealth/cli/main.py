@@ -13,16 +13,16 @@ os.environ.setdefault("MALLOC_TRIM_THRESHOLD_", str(1 << 28))
 os.environ.setdefault("MALLOC_MMAP_THRESHOLD_", str(1 << 26))
 
 import signal
-import threading
-from collections.abc import Iterator
-from contextlib import contextmanager
 from importlib import import_module
-from typing import Any, NoReturn
+from typing import Any
 
-import click
-
-from lmshealth.cli.terminal import print_errors, standard_streams
+from lmshealth.cli.interrupts import Interrupted, ended_by_signals, loading
 from lmshealth.errors import LmshealthError
+
+with loading():  # both take most of the time of a start
+    import click
+
+    from lmshealth.cli.terminal import print_errors, standard_streams
 
 # What is imported and drawn stays: looking for cycles more often takes an eighth of its time, and
 # freeing what is left at the end half a second.
@@ -46,42 +46,13 @@ _COMMANDS = {
     "track": ("machine_commands", "Track modes through a table of estimates."),
     "watch": ("archive_commands", "Run over a folder of logs whenever logs arrive."),
 }
-# Python itself raises KeyboardInterrupt for SIGINT.
-_ENDS = [one for one in signal.Signals if one.name in ("SIGTERM", "SIGHUP")]
-
-
-class _Interrupted(KeyboardInterrupt):
-    """End that another process asks for, with the number of its signal; as Ctrl-C otherwise."""
-
-
-def _end(number: int, frame: object) -> NoReturn:
-    """Handle a signal; a second one, as `timeout` sends, must not disturb the end."""
-    for name in _ENDS:
-        signal.signal(name, signal.SIG_IGN)
-    raise _Interrupted(number)
-
-
-@contextmanager
-def _ended_by_signals() -> Iterator[None]:
-    """Treat SIGTERM and SIGHUP as interrupts."""
-    main = threading.current_thread() is threading.main_thread()
-    # `nohup` ignores SIGHUP; other handlers are of a program that calls this one.
-    handled = [name for name in _ENDS if main and signal.getsignal(name) == signal.SIG_DFL]
-    for name in handled:
-        signal.signal(name, _end)
-    try:
-        yield
-    finally:
-        for name in handled:
-            if signal.getsignal(name) is _end:
-                signal.signal(name, signal.SIG_DFL)
 
 
 class _Group(click.Group):
     """Group that reports errors in one line on standard error, with exit status 1."""
 
     def main(self, *arguments: Any, **options: Any) -> Any:
-        with _ended_by_signals(), standard_streams():
+        with ended_by_signals(), standard_streams():
             return super().main(*arguments, **options)
 
     def list_commands(self, ctx: click.Context) -> list[str]:
@@ -106,7 +77,7 @@ class _Group(click.Group):
         except OSError as error:
             print_errors([f"{error.filename or 'output'}: {error.strerror}"])
         except KeyboardInterrupt as error:
-            asked = isinstance(error, _Interrupted)
+            asked = isinstance(error, Interrupted)
             number = error.args[0] if asked else signal.SIGINT
             if ctx.invoked_subcommand == "watch" and number == signal.SIGTERM:
                 ctx.exit(0)  # as a service ends

@@ -408,11 +408,12 @@ def write_index(
     refused: Sequence[Refusal],
     *,
     today: date | None = None,
+    gone: Sequence[Status] = (),
 ) -> Path:
     """Write ``index.html`` and ``how-to-read.html``; the order of the summaries is of no effect.
 
     ``refused`` are logs that were not analysed; ``today`` is the day of the page, by default
-    that of the newest log.
+    that of the newest log; ``gone`` are the last statuses of machines without a usable log now.
     """
     ranked = by_urgency(summaries)
     script = read("index.js") if len(ranked) > constants.MANY_MACHINES else ""
@@ -439,6 +440,7 @@ def write_index(
         lives=_lives(ranked) if script else [],
         newest=newest,
         refused=by_reason,
+        gone=[(one, (folder / one.page).exists()) for one in gone],
         fold=len(refused) > constants.REFUSED_UNFOLDED,
         script=script,
     )

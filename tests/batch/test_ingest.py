@@ -9,12 +9,15 @@ from threading import Thread
 from time import process_time
 from typing import Any
 
+import h5py
 import numpy as np
+import pandas as pd
 import pytest
 
 from lmshealth.batch import constants
 from lmshealth.batch.alerts import Alerts
 from lmshealth.batch.ingest import Settings, _identified, _Outcome, _Task, _within, identify_log
+from lmshealth.batch.run import run
 from lmshealth.batch.store import Resources, Store
 from lmshealth.batch.workers import Item, OnCrash, Pool, Result, Task
 from lmshealth.errors import BadLog, LmshealthError
@@ -22,7 +25,7 @@ from lmshealth.io.log import Refusal
 from lmshealth.io.manifest import copy_error
 from lmshealth.modal.log_estimates import LogEstimates
 from lmshealth.stage.description import load_stage
-from tests.signals import Mode, accelerations
+from tests.signals import Mode, accelerations, write_archive_stage, write_log
 
 BAD = "log-0013"
 
@@ -146,3 +149,20 @@ def test_impossible_settings_are_refused(given: dict[str, Any], text: str) -> No
     """Each is named with its value, and what is needed."""
     with pytest.raises(LmshealthError, match=f"^Settings: {text}"):
         Settings(**given)
+
+
+def test_a_recording_that_is_stored_in_two_forms_is_analysed_once(tmp_path: Path) -> None:
+    """An attribute or a compression makes another file of it; the listed one is analysed."""
+    folder = tmp_path / "logs"
+    first, other = write_log(folder / "1.h5", 1.0, 0), write_log(folder / "2.h5", 0.98, 1)
+    copy = folder / "0-copy.h5"
+    copy.write_bytes(other.read_bytes())
+    with h5py.File(copy, "a") as file:
+        file.attrs["remark"] = "exported again"
+    rows = "".join(f"{path.name},{100 * k}\n" for k, path in enumerate((first, other)))
+    (folder / "manifest.csv").write_text(f"file,travel_km\n{rows}")
+    stage = load_stage(write_archive_stage(tmp_path))
+    result = run(folder, [stage], tmp_path / "out")
+    refused = pd.read_csv(tmp_path / "out" / "refused.csv")
+    assert dict(zip(refused["log"], refused["reason"], strict=True)) == {"0-copy.h5": "duplicate"}
+    assert (result.n_logs, result.n_refused, result.n_unlisted) == (2, 0, 0)

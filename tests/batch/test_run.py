@@ -1129,7 +1129,7 @@ def test_a_fleet_prior_continues_from_the_draws_by_the_description(
     fresh = prognose(history, prior.apply_to(own.stage), seed=1, chains=False)
     chains = Mock(side_effect=NotConverged("not here", np.empty(0)))
     monkeypatch.setattr(life_posterior, "sample", chains)
-    stored = LifeState(start, 15, "healthy", "", ())
+    stored = LifeState(start, 15, "healthy", "", (), None)
     machine = Machine("M7-Y", (), own.stage, NO_MAINTENANCE, 40, 0)
     update = machine, "key", prior, ()
     [made] = assessing._update((update, pack(own), pack(stored)))

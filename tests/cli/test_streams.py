@@ -13,8 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lmshealth.cli import main as command_line
-from lmshealth.cli import terminal
+from lmshealth.cli import interrupts, terminal
 from lmshealth.io.formats.isolation import INTERRUPTS
 from tests.signals import write_archive_stage, write_log
 
@@ -78,17 +77,29 @@ def test_signals_are_interrupts_while_a_command_runs() -> None:
     before = {one: signal.signal(one, signal.SIG_DFL) for one in asked}
     try:
         signal.signal(asked[0], signal.SIG_IGN)
-        with pytest.raises(KeyboardInterrupt), command_line._ended_by_signals():
+        with pytest.raises(KeyboardInterrupt), interrupts.ended_by_signals():
             assert signal.getsignal(asked[0]) is signal.SIG_IGN
             signal.raise_signal(asked[-1])
         assert {signal.getsignal(one) for one in asked} == {signal.SIG_IGN}
         signal.signal(asked[-1], signal.SIG_DFL)
-        with command_line._ended_by_signals():
-            assert signal.getsignal(asked[-1]) is command_line._end
+        with interrupts.ended_by_signals():
+            assert signal.getsignal(asked[-1]) is interrupts._end
         assert signal.getsignal(asked[-1]) is signal.SIG_DFL
     finally:
         for one, handler in before.items():
             signal.signal(one, handler)
+
+
+@pytest.mark.parametrize("error", [KeyboardInterrupt(), interrupts.Interrupted(signal.SIGTERM)])
+def test_an_interrupt_while_modules_load_is_one_line(
+    error: KeyboardInterrupt, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Before there is a command the exit status is that of shells, too, without a traceback."""
+    with pytest.raises(SystemExit) as end, interrupts.loading():
+        raise error
+    number = error.args[0] if error.args else signal.SIGINT
+    assert end.value.code == 128 + number
+    assert capsys.readouterr().err == "lmshealth: interrupted\n"
 
 
 REDIRECTIONS = [

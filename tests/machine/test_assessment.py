@@ -188,7 +188,7 @@ def test_a_mode_that_moves_alone_is_the_verdict(tmp_path: Path) -> None:
 
 
 def test_work_on_one_part_keeps_the_loss_of_the_other(fits: list[tuple[bool, bool]]) -> None:
-    """Fractions of what was not restored are of commissioning: the example ends at a preload of 72 %.
+    """Fractions of what was not restored are of commissioning: of the preload 72 % is left.
 
     Control: after work on the guide they are of the state after it, and the mount keeps its loss.
     """

@@ -253,6 +253,8 @@ def test_what_work_ends_without_a_new_log_is_announced(code: str) -> None:
     served, changes = compare(found, status(works=2), TODAY, None)
     assert [str(one) for one in changes] == [f"M7-Y: recovered {code} → work was entered"]
     assert compare(served, status(works=2), TODAY, None)[1] == []
+    fewer = compare(found, status(works=0), TODAY, None)[1]
+    assert [str(one) for one in fewer] == [f"M7-Y: recovered {code} → maintenance.csv was changed"]
     again = msgspec.structs.replace(bad, works=2)
     assert [one.what for one in compare(served, again, TODAY, None)[1]] == [code]
 

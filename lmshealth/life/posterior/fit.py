@@ -198,7 +198,7 @@ class LifePosterior:
         x = np.asarray(x + share * data.free * rng.standard_normal(x.shape))
         if self.carried is None:
             return x
-        return x + rng.choice(self.carried.reshape(-1, x.shape[-1]), x.shape[1])
+        return np.asarray(x + rng.choice(self.carried.reshape(-1, x.shape[-1]), x.shape[1]))
 
     def laws(self, parameter: str) -> dict[tuple[str, float], float]:
         """Return the probability of each law of a parameter by its kind and begin in m."""

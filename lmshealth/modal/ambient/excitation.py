@@ -72,7 +72,8 @@ def unsteadiness(
     ``modes`` are f in Hz and ζ of all modes of the fit, ``forces`` the covariance of their forces,
     ``(n_modes, n_modes)``, and ``shapes`` are ``(n_modes, n_channels)``.
     """
-    f, zeta = (own[i] for own in modes)
+    every_f, every_zeta = modes
+    f, zeta = every_f[i], every_zeta[i]
     fourth = square = total = 0.0
     n = 0
     for spectrum, mask, e in zip(spectra, masks, expected, strict=True):
@@ -82,7 +83,7 @@ def unsteadiness(
         place = np.flatnonzero(near)
         # The force given all channels, Σ_j S_ij h_j* φ_jᴴ E⁻¹ F: without the other modes, which
         # forces in common move, only what these leave would remain. At twice the rate of its band.
-        h = response(*(own[:, None] for own in modes), spectrum.frequency[near])
+        h = response(every_f[:, None], every_zeta[:, None], spectrum.frequency[near])
         seen = np.einsum("j,jk,jc->kc", forces[i].conj(), h, shapes)
         weight = np.linalg.solve(e[near], seen[..., None])[..., 0]
         size = 2 * (place[-1] + 1 - place[0])
