@@ -195,7 +195,8 @@ def ingest(
         done += len(part)
         progress("identifying", done, len(tasks))
     unlisted = {name_of(path, folder) for path in found if manifest.omits(path)}
-    refused += _copies(recordings, unlisted, store)
+    listed = {name_of(path, folder) for path in found if manifest.names(path)}
+    refused += _copies(recordings, listed, store)
     copies = {one.log for one in refused if one.reason == "duplicate"}
     groups = {
         machine: {by: [key for key in own if key[0] not in copies] for by, own in each.items()}
@@ -222,12 +223,12 @@ def ingest(
 
 
 def _copies(
-    recordings: Mapping[str, Sequence[LogKey]], unlisted: Container[str], store: Store
+    recordings: Mapping[str, Sequence[LogKey]], listed: Container[str], store: Store
 ) -> list[Refusal]:
     """Refuse logs that are the recording of another file; of several a listed one is analysed."""
     refused = []
     for keys in (own for own in recordings.values() if len(own) > 1):
-        order = sorted(keys, key=lambda key: (key[0] in unlisted, key[0]))
+        order = sorted(keys, key=lambda key: (key[0] not in listed, key[0]))
         known = dict(store.of_keys("identified", (key for _, key in order)))
         found = [(log, unpack_or_none(known.get(key), Identified)) for log, key in order]
         outcomes = [own.renamed(log).outcome for log, own in found if own is not None]

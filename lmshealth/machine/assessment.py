@@ -22,6 +22,7 @@ from lmshealth.io.log import Notice, Refusal, utc_day
 from lmshealth.io.refusal import listed
 from lmshealth.life import constants, fleet_prior
 from lmshealth.life.health import Health, epochs_to_publish, health_of
+from lmshealth.life.posterior.data import with_clock
 from lmshealth.life.posterior.exploration import LifeStart
 from lmshealth.life.posterior.fit import LifePosterior, fit_life
 from lmshealth.life.prognosis import Prognosis, parameters_with_limit, prognosis_of
@@ -426,12 +427,14 @@ def _carried(
 ) -> FloatArray | None:
     """Draw what lives before the present baseline have left, as `Assessment.carried`.
 
-    Work restores the parameters that `restored` names; a baseline that is declared without work
-    begins anew. Of a life with too few logs nothing is known, and nothing is carried.
+    By their laws up to the present baseline, as wear goes on after their last log. Work restores
+    the parameters that `restored` names; a baseline that is declared without work begins anew. Of a
+    life with too few logs nothing is known, and nothing is carried.
     """
     words = {one.name: one.word for one in stage.parameters}
     rng = np.random.default_rng(stream(seed, _CARRIED_STEP))
     left, moments = np.zeros((constants.N_DRAWS, len(words))), history.recorded_at
+    travel = with_clock(history, stage).travel
     resets = [step.first for step in history.steps if step.kind == "reset"]
     for begin, after in pairwise(history.baselines):
         end = next((first for first in resets if begin < first <= after), None)
@@ -441,7 +444,8 @@ def _carried(
         done = {a.action for a in work.actions if moments[end - 1] < a.recorded_at <= moments[end]}
         with suppress(LmshealthError, LinAlgError):
             life = fit_life(history.first_logs(end), stage, seed, chains=False)
-            draws = np.log(np.maximum(life.health, _LEAST_HEALTH)).reshape(-1, len(words))
+            health = life.health_at(np.array([travel[after] - travel[begin]]), rng)[0]
+            draws = np.log(np.maximum(health, _LEAST_HEALTH)).reshape(-1, len(words))
             left += rng.choice(draws, len(left))
         again = restored(words, done)
         left[:, [name in again for name in words]] = 0.0
