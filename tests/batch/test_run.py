@@ -1018,7 +1018,7 @@ def test_an_archive_of_bad_logs_only_is_an_error_with_its_reasons_written(
 def test_without_a_usable_log_the_index_is_as_empty_as_the_tables(
     tmp_path: Path, modes_only: Stage
 ) -> None:
-    """The index does not keep the machines of the run before."""
+    """The index keeps of the machines of the run before a link to their last page."""
     logs, out = write_archive(tmp_path / "logs", 1), tmp_path / "out"
     run(logs, [modes_only], out)
     assert "test-A" in (out / "index.html").read_text()
@@ -1027,7 +1027,9 @@ def test_without_a_usable_log_the_index_is_as_empty_as_the_tables(
         run(logs, [modes_only], out)
     assert rows(out / "modes.csv") == []
     index = (out / "index.html").read_text()
-    assert "test-A" not in index and "No log belongs to a stage." in index
+    assert '<tr role="row" data-state' not in index and "No log belongs to a stage." in index
+    _, gone = index.split("Without a usable log in this run")
+    assert '<a href="test-A.html">test-A</a>.</p>' in gone
 
 
 def test_a_table_that_cannot_be_read_is_named_before_the_logs(

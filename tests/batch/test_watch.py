@@ -52,7 +52,9 @@ def runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[Sequence[
                 raise Ended
             action()
 
-        def run(folder: Path, stages: object, out: Path, settings: Settings) -> RunResult:
+        def run(
+            folder: Path, stages: object, out: Path, settings: Settings, progress: object
+        ) -> RunResult:
             seen.append((n, {path.name for path in settings.growing}))
             if not any(folder.glob("*.csv")):
                 raise NothingUsable("no log")

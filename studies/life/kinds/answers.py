@@ -75,6 +75,8 @@ def answer(logs: Answer, map_table: str, seed: int, how: str = PUBLISHED) -> Ans
     """Assess a life: verdict, draws of ln health now and of the travel left, service."""
     start = time.process_time()
     with _shortened(how) as options:
+        if logs["work"][0]:
+            options |= {"work": _maintenance(*logs["work"])}
         made = lmshealth.assess(readings_of(logs), stage_of(map_table), seed=seed, **options)
     service, judged = made.service(), made.judgement
     found: Answer = {
@@ -90,6 +92,11 @@ def answer(logs: Answer, map_table: str, seed: int, how: str = PUBLISHED) -> Ans
         km = np.minimum(made.prognosis.remaining[:, -1] / _KM, _NEVER_KM)
         found["left_km"] = _quantiles(km)
     return found | {"cpu_s": round(time.process_time() - start, 2)}
+
+
+def _maintenance(action: str, moment: str) -> Any:
+    module: Any = import_module("lmshealth.tracking.maintenance")
+    return module.Maintenance((module.Action("AX-1", datetime.fromisoformat(moment), action),))
 
 
 @contextmanager

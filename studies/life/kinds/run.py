@@ -9,8 +9,9 @@ Method
     1.6e-3), seasons, and a random walk of 3e-4. `worlds.py` draws what becomes of it: courses of
     the preload that the description has (hertz) and has not, a mount that loosens, both, a mount
     that settles stiffer while the preload wears ("opposite"), one mode that moves by another cause,
-    steps, a usage that doubles, a wander that all modes have in common, and machines that stay as
-    they are. `lmshealth.assess` answers, with the chains that it publishes.
+    steps, work that restores the other part, a usage that doubles, a wander that all modes have in
+    common, and machines that stay as they are. `lmshealth.assess` answers, with the chains that it
+    publishes.
     Each kind is judged by itself: a share over lives that wear and lives that do not hides both.
     Places of the truth among draws, ties at random, give the shares of 90 and 50 % intervals that
     hold; widths are compared with those of a posterior that knows the shape of every course, all

@@ -59,6 +59,8 @@ class World:
     # Standard deviation of the jumps of ln f at one log, which is declared as a retuning.
     retuned: float = 0.0
     jumps: bool = False  # whether the verdict ``step`` is right
+    # Action in the middle third that restores the one parameter; the other's limit ends the life.
+    work: str = ""
 
 
 COURSES = (
@@ -78,7 +80,10 @@ OTHERS = {
     "preload, linear, a sudden loss": World(preload="jump", jumps=True),
     "preload, linear, common wander": World(preload="linear", walk=0.0, common=2e-3),
     "preload, linear, usage doubles": World(preload="linear", busier=2.0),
+    "preload, hertz, mount tightened": World("hertz", "loosening", work="mount-tightened"),
+    "mount, loosening, guide replaced": World("hertz", "loosening", work="guide-replaced"),
 }
+RESTORED = {"guide-replaced": 0, "mount-tightened": 1}
 LONE = {
     f"{mode} alone, {100 * size:.0f} %": World(lone=(mode, size))
     for mode in MODES
@@ -111,6 +116,7 @@ class Life:
     left_km: float  # true, to the first limit; inf if never
     left_days: float
     retuned_at: int  # first log after the declared step; their number without one
+    worked_at: int  # first log after the work; their number without any
 
     @property
     def ln_health(self) -> Array:
@@ -135,7 +141,12 @@ class Life:
         """Return what is known of the life, as JSON can express it."""
         moments = [(_START + timedelta(days=float(day))).isoformat() for day in self.days]
         tuned = np.arange(N_LOGS) >= self.retuned_at
+        work = ""
+        if self.world.work:
+            day = float(self.days[self.worked_at - 1 : self.worked_at + 1].mean())
+            work = (_START + timedelta(days=day)).isoformat()
         return {
+            "work": [self.world.work, work],
             "modes": MODES,
             "recorded_at": moments,
             "travel": self.travel.tolist(),
@@ -198,7 +209,7 @@ def life_of(name: str, number: int) -> Life:
     u = share * np.r_[0.0, np.sort(rng.uniform(size=N_LOGS - 2)), 1.0]
     length_km = LIFE_KM[0] * float(np.exp(LIFE_KM[1] * rng.standard_normal()))
     km_per_day = float(rng.uniform(*KM_PER_DAY))
-    size, lost = _losses(rng, world, u)
+    size, lost, worked_at = _losses(rng, world, u)
     ln_health = np.log1p(-size * lost)
     wrong = world.map_error * rng.standard_normal((2, len(MODES)))
     true = drift(ln_health) + np.sum(wrong * drifts_alone(ln_health), axis=-2)
@@ -226,14 +237,22 @@ def life_of(name: str, number: int) -> Life:
         ln_f=ln_f + std * rng.standard_normal(std.shape), std=std,
         ln_zeta=LN_ZETA + STD_ZETA * rng.standard_normal(std.shape), size=size, course=lost,
         left_km=left, left_days=left / km_per_day, retuned_at=retuned_at,
+        worked_at=worked_at,
     )  # fmt: skip
 
 
-def _losses(rng: np.random.Generator, world: World, u: Array) -> tuple[Array, Array]:
-    """Draw what each parameter loses; of two the first to reach its limit does so at u = 1."""
+def _losses(rng: np.random.Generator, world: World, u: Array) -> tuple[Array, Array, int]:
+    """Draw what each parameter loses; of two the first to reach its limit does so at u = 1.
+
+    One that work restores begins anew at the log that is returned; their number without work.
+    """
     size, lost, slower = np.zeros(2), np.zeros((N_LOGS, 2)), np.ones(2)
+    worked_at, restored = N_LOGS, RESTORED.get(world.work)
     if world.preload and world.mount:
-        slower[rng.integers(2)] = rng.uniform(1.0, 1.6)
+        later = int(rng.integers(2)) if restored is None else restored
+        slower[later] = rng.uniform(1.0, 1.6)
+    if restored is not None:
+        worked_at = int(rng.integers(N_LOGS // 3, 2 * N_LOGS // 3))
     for j, (parameter, kind) in enumerate(
         zip(PARAMETERS, (world.preload, world.mount), strict=True)
     ):
@@ -241,8 +260,11 @@ def _losses(rng: np.random.Generator, world: World, u: Array) -> tuple[Array, Ar
             size[j], lost[:, j] = -rng.uniform(0.08, 0.2), -np.expm1(-u / rng.uniform(0.15, 0.5))
         elif kind:
             own = u if world.mount == "settling" else u / slower[j]
-            size[j], lost[:, j] = 1 - LIMITS[parameter], course(rng, kind)(own)
-    return size, lost
+            by = course(rng, kind)
+            size[j], lost[:, j] = 1 - LIMITS[parameter], by(own)
+            if j == restored:
+                lost[worked_at:, j] = by(own[worked_at:] - own[worked_at])
+    return size, lost, worked_at
 
 
 def _smooth(rng: np.random.Generator, part: Array) -> Array:
