@@ -131,11 +131,14 @@ class LifePosterior:
     def carrying(self, ln_health: FloatArray) -> LifePosterior:
         """Return the posterior of a life that begins with losses, of which there are draws.
 
-        Their shape is ``(n, n_parameters)``; those of a life and of the lives before it are
-        independent.
+        Their shape is ``(n, n_parameters)``. The errors of the map are common to all lives of a
+        machine: the larger losses before are paired with the larger ones since.
         """
-        rng = np.random.default_rng(stream(self.seed, _CARRIED_STEP))
-        carried = rng.choice(ln_health, self.health.shape[:2])
+        rng, shape = np.random.default_rng(stream(self.seed, _CARRIED_STEP)), self.health.shape
+        flat = self.health.reshape(-1, shape[-1])
+        ranks = flat.argsort(axis=0).argsort(axis=0)
+        draws = np.sort(rng.choice(ln_health, len(flat)), axis=0)
+        carried = np.take_along_axis(draws, ranks, axis=0).reshape(shape)
         health = self.health * np.exp(carried)
         return replace(self, health=health, off=self.off + carried, carried=carried)
 
