@@ -9,13 +9,15 @@ from dataclasses import dataclass, replace
 from typing import TypeVar
 
 from lmshealth._private.serialize import VERSION, fingerprint, pack
-from lmshealth.batch.ingest import LogKey, unexpected
+from lmshealth.batch.ingest import unexpected
 from lmshealth.batch.store import (
-    Identified,
+    LogKey,
     PackedAssessment,
+    PackedLogs,
     Resources,
     Store,
     cached,
+    unpack_logs,
     unpack_or_none,
 )
 from lmshealth.errors import LmshealthError
@@ -27,12 +29,8 @@ from lmshealth.machine.assessment import (
     with_calibration,
     with_fleet_prior,
 )
-from lmshealth.modal.log_estimates import LogEstimates
 from lmshealth.stage.description import Stage
 from lmshealth.tracking.maintenance import Maintenance
-
-PackedLogs = tuple[tuple[str, bytes], ...]
-"""Names of logs, and their packed estimates."""
 
 _Job = tuple["Machine", PackedLogs, bytes | None]  # with a packed `LifeState`
 # With the key of the result; without a prior the prognosis is calibrated by ended lives.
@@ -84,7 +82,7 @@ def assess_all(
         [one] = part
         key = _life_key(one.stage, one.seed)
         known = None if force else store.part(one.name, key, after=one.key)
-        return one, packed_logs(one, store), known
+        return one, store.packed_logs(one.logs), known
 
     def key(one: Machine) -> str:
         return fingerprint(one.name, one.key)
@@ -98,19 +96,6 @@ def assess_all(
             failed[machine.name] = made
         resources.progress("assessing", k, len(machines))
     return failed
-
-
-def packed_logs(machine: Machine, store: Store) -> PackedLogs:
-    """Fetch the names and the packed estimates of the logs of a machine."""
-    contents = dict(store.of_keys("identified", (key for _, key in machine.logs)))
-    return tuple((log, contents[key]) for log, key in machine.logs if key in contents)
-
-
-def unpack_logs(logs: PackedLogs) -> list[LogEstimates]:
-    """Decode estimates, under the present names of their logs."""
-    found = [(log, unpack_or_none(content, Identified)) for log, content in logs]
-    outcomes = [own.renamed(log).outcome for log, own in found if own is not None]
-    return [outcome for outcome in outcomes if isinstance(outcome, LogEstimates)]
 
 
 def pack_assessment(assessment: Assessment) -> PackedAssessment:

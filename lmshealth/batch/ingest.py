@@ -16,7 +16,15 @@ from typing import Any, NamedTuple, Self
 from lmshealth._private.serialize import VERSION, fingerprint, pack
 from lmshealth.batch import constants
 from lmshealth.batch.alerts import Alerts
-from lmshealth.batch.store import Identified, Resources, Store, cached, unpack_or_none
+from lmshealth.batch.store import (
+    Identified,
+    LogKey,
+    Resources,
+    Store,
+    cached,
+    unpack_logs,
+    unpack_or_none,
+)
 from lmshealth.batch.workers import Pool, Threads, cluster, processes
 from lmshealth.errors import BadLog, LmshealthError
 from lmshealth.io.column_map import ColumnMap
@@ -29,9 +37,6 @@ from lmshealth.io.refusal import visible
 from lmshealth.modal.log_estimates import LogEstimates, without_copies
 from lmshealth.report.language import LANGUAGES, Language
 from lmshealth.stage.description import Stage, why_unmatched
-
-LogKey = tuple[str, str]
-"""Name of a log, and the key of its estimates in the store."""
 
 _logger = logging.getLogger(__name__)
 
@@ -166,10 +171,7 @@ def ingest(
     logs = (path for path in archive.logs if path not in settings.growing)
     found = [path for path in logs if inside not in path.resolve().parents]
     tasks, refused = _tasks(folder, found, manifest, settings.columns, resources)
-    # By machine and description; only names and keys are kept, not the estimates.
-    groups: dict[str, dict[str, list[LogKey]]] = {}
-    recordings: dict[str, list[LogKey]] = {}
-    lost: list[Refusal] = []
+    usable, lost = list[_Outcome](), list[Refusal]()
     # Machine of each log, by the manifest or its own metadata.
     owners = {name_of(path, folder): row.get("stage") for path, row in manifest.rows.items()}
     declared = {name_of(path, folder) for path in manifest.rows if manifest.is_baseline(path)}
@@ -187,59 +189,53 @@ def ingest(
         for one in part:
             lost += one.refused
             owners[one.key[0]] = one.machine or owners.get(one.key[0])
-            if not one.refused:
-                own = groups.setdefault(str(one.machine), {})
-                own.setdefault(one.description, []).append(one.key)
-                recordings.setdefault(one.recording, []).append(one.key)
+        # Only names and keys are kept, not the estimates.
+        usable += [one._replace(packed=None) for one in part if not one.refused]
         n_cached += 0 if is_new else len(part)
         done += len(part)
         progress("identifying", done, len(tasks))
-    unlisted = {name_of(path, folder) for path in found if manifest.omits(path)}
-    listed = {name_of(path, folder) for path in found if manifest.names(path)}
-    refused += _copies(recordings, listed, store)
+    names = {name_of(path, folder): path for path in found}
+    refused += _copies(usable, {name for name in names if manifest.names(names[name])}, store)
     copies = {one.log for one in refused if one.reason == "duplicate"}
-    groups = {
-        machine: {by: [key for key in own if key[0] not in copies] for by, own in each.items()}
-        for machine, each in groups.items()
-    }
     refused += [
         Refusal(name, "not-listed", "it is read with its own metadata; add a row")
-        for name in sorted(unlisted - copies)
+        for name, path in names.items()
+        if manifest.omits(path) and name not in copies
     ]
-    names = {name_of(path, folder) for path in found}
-    names |= {one.log for one in (*archive.refused, *manifest.refused)}
-    machines, others = _grouped(groups, stages)
+    machines, others = _grouped([one for one in usable if one.key[0] not in copies], stages)
     lost = sorted([*lost, *others], key=lambda refusal: refusal.log)
     every = (
         replace(one, machine=owners.get(one.log) or "", baseline=one.log in declared)
         for one in (*archive.refused, *refused, *lost)
     )
+    known = (*names, *(one.log for one in (*archive.refused, *manifest.refused)))
     return Ingested(
         machines=machines,
         refused=tuple(every),
-        logs=frozenset(name for name in names if PurePosixPath(name).name not in NOT_LOGS),
+        logs=frozenset(name for name in known if PurePosixPath(name).name not in NOT_LOGS),
         n_cached=n_cached,
     )
 
 
-def _copies(
-    recordings: Mapping[str, Sequence[LogKey]], listed: Container[str], store: Store
-) -> list[Refusal]:
+def _copies(usable: Iterable[_Outcome], listed: Container[str], store: Store) -> list[Refusal]:
     """Refuse logs that are the recording of another file; of several a listed one is analysed."""
-    refused = []
+    recordings, refused = dict[str, list[LogKey]](), list[Refusal]()
+    for one in usable:
+        recordings.setdefault(one.recording, []).append(one.key)
     for keys in (own for own in recordings.values() if len(own) > 1):
         order = sorted(keys, key=lambda key: (key[0] not in listed, key[0]))
-        known = dict(store.of_keys("identified", (key for _, key in order)))
-        found = [(log, unpack_or_none(known.get(key), Identified)) for log, key in order]
-        outcomes = [own.renamed(log).outcome for log, own in found if own is not None]
-        refused += without_copies([one for one in outcomes if isinstance(one, LogEstimates)])[1]
+        refused += without_copies(unpack_logs(store.packed_logs(order)))[1]
     return refused
 
 
 def _grouped(
-    found: dict[str, dict[str, list[LogKey]]], stages: Sequence[Stage]
+    usable: Iterable[_Outcome], stages: Sequence[Stage]
 ) -> tuple[dict[str, tuple[Stage, tuple[LogKey, ...]]], list[Refusal]]:
     """Return description and logs of each machine, and refusals of logs of its other ones."""
+    found = dict[str, dict[str, list[LogKey]]]()
+    for one in usable:
+        own = found.setdefault(str(one.machine), {})
+        own.setdefault(one.description, []).append(one.key)
     by_digest = {stage.digest: stage for stage in stages}
     order, machines, refused = [*by_digest], {}, list[Refusal]()
     for name, by in sorted(found.items()):

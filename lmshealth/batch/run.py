@@ -28,20 +28,19 @@ from lmshealth.batch.alerts import FILE as STATUSES
 from lmshealth.batch.alerts import Scope, announce, deliver, last_number, write_statuses
 from lmshealth.batch.assess import (
     Machine,
-    PackedLogs,
     apply_fleet_priors,
     assess_all,
-    packed_logs,
     reason_if_failed,
-    unpack_logs,
 )
 from lmshealth.batch.ingest import Ingested, Settings, ingest
 from lmshealth.batch.store import (
+    PackedLogs,
     Published,
     Resources,
     Store,
     cached,
     default_url,
+    unpack_logs,
     unpack_or_none,
 )
 from lmshealth.batch.workers import Progress
@@ -518,7 +517,7 @@ def _tables(
     tables = {name: output.tables for name, output in made.items()}
 
     def of_logs(machine: Machine) -> dict[str, bytes]:
-        logs = unpack_logs(packed_logs(machine, store))
+        logs = unpack_logs(store.packed_logs(machine.logs))
         rows = refused_rows([own for one in logs for own in one.modes.refused])
         texts = {"refused": csv_text("refused", rows), **_tables_of_logs(logs)}
         return {name: pack(text) for name, text in texts.items()}
@@ -551,7 +550,7 @@ def _outputs(
 
     def job(part: Sequence[Machine]) -> MachineRecord:
         [machine] = part
-        return records[machine.name](packed_logs(machine, store))
+        return records[machine.name](store.packed_logs(machine.logs))
 
     how: Any = {"key": lambda machine: own[machine.name], "fetch": fetch, "job": job}
     for [(machine, drawn)], is_new in cached(output_or_reason, machines, resources, **how):

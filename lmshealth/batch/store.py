@@ -34,6 +34,12 @@ from lmshealth.modal.log_estimates import LogEstimates
 Outcome = LogEstimates | tuple[Refusal, ...]
 """Result of a log: its modal estimates, or why it was refused."""
 
+LogKey = tuple[str, str]
+"""Name of a log, and the key of its estimates."""
+
+PackedLogs = tuple[tuple[str, bytes], ...]
+"""Names of logs, and their packed estimates."""
+
 Record = TypeVar("Record")
 
 _SEAL_BYTES = 16  # digest of a value and its keys, before the value
@@ -147,6 +153,13 @@ def unpack_or_none(content: bytes | None, kind: Any) -> Any:
     except ValueError as error:
         _logger.debug("%s", error)
         return None
+
+
+def unpack_logs(logs: PackedLogs) -> list[LogEstimates]:
+    """Decode estimates, under the present names of their logs."""
+    found = [(log, unpack_or_none(content, Identified)) for log, content in logs]
+    outcomes = [own.renamed(log).outcome for log, own in found if own is not None]
+    return [outcome for outcome in outcomes if isinstance(outcome, LogEstimates)]
 
 
 def default_url(folder: Path) -> URL:
@@ -378,6 +391,11 @@ class Store:
         for first in range(0, len(asked), constants.ROWS_PER_QUERY):
             part = asked[first : first + constants.ROWS_PER_QUERY]
             yield from self._intact(kind, VALUES.c.owner == "", VALUES.c.key.in_(part))
+
+    def packed_logs(self, logs: Sequence[LogKey]) -> PackedLogs:
+        """Fetch the names and the packed estimates of logs."""
+        contents = dict(self.of_keys("identified", (key for _, key in logs)))
+        return tuple((log, contents[key]) for log, key in logs if key in contents)
 
     def _decoded(self, kind: str, of: type[Record], machine: str | None = None) -> list[Record]:
         """Fetch those values of a machine, or of all, that this version can decode."""

@@ -3,7 +3,7 @@
 README.md has both models.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 
@@ -350,20 +350,26 @@ class Calibration:
     travel: float
 
 
+def lives_before(history: History) -> Iterator[tuple[int, int, int]]:
+    """Yield first log, end and next baseline of each life before the present one.
+
+    A life ends at the work after its baseline, which may be logs before the next baseline.
+    """
+    resets = [step.first for step in history.steps if step.kind == "reset"]
+    for begin, after in pairwise(history.baselines):
+        yield begin, min(next((first for first in resets if begin < first), after), after), after
+
+
 def ended_lives(history: History, stage: Stage, seed: int | Sequence[int]) -> tuple[EndedLife, ...]:
     """Predict the ends of the lives before the present baseline, and compare with their ends.
 
-    A life ends at the work after its baseline. Lives without a prognosis, as they are too short,
-    are left out.
+    Lives without a prognosis, as they are too short, are left out.
     """
     found = []
     history = with_clock(history, stage)
-    resets = [step.first for step in history.steps if step.kind == "reset"]
-    for begin, after in pairwise(history.baselines):
-        # The work may be logs before the next baseline.
-        end = next((first for first in resets if begin < first), after)
+    for _, end, _ in lives_before(history):
         try:
-            found.append(_ended_life(history.first_logs(min(end, after)), stage, seed))
+            found.append(_ended_life(history.first_logs(end), stage, seed))
         except (LmshealthError, LinAlgError):  # no ended life must end the present one
             continue
     return tuple(one for one in found if one is not None)

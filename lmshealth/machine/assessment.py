@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from datetime import date
-from itertools import compress, pairwise, takewhile
+from itertools import compress, takewhile
 
 import numpy as np
 from numpy.linalg import LinAlgError
@@ -427,27 +427,23 @@ def _carried(
 ) -> FloatArray | None:
     """Draw what lives before the present baseline have left, as `Assessment.carried`.
 
-    By their laws up to the present baseline, as wear goes on after their last log. Work restores
-    the parameters that `restored` names; a baseline that is declared without work begins anew. Of a
-    life with too few logs nothing is known, and nothing is carried.
+    By their laws up to the next baseline, as wear goes on after their last log. Work restores the
+    parameters that `restored` names. Of a life with too few logs nothing is known, and nothing is
+    carried.
     """
     words = {one.name: one.word for one in stage.parameters}
     rng = np.random.default_rng(stream(seed, _CARRIED_STEP))
     left, moments = np.zeros((constants.N_DRAWS, len(words))), history.recorded_at
     travel = with_clock(history, stage).travel
-    resets = [step.first for step in history.steps if step.kind == "reset"]
-    for begin, after in pairwise(history.baselines):
-        end = next((first for first in resets if begin < first <= after), None)
-        if end is None:
-            left[:] = 0.0
-            continue
+    for begin, end, after in fleet_prior.lives_before(history):
         done = {a.action for a in work.actions if moments[end - 1] < a.recorded_at <= moments[end]}
-        with suppress(LmshealthError, LinAlgError):
-            life = fit_life(history.first_logs(end), stage, seed, chains=False)
-            health = life.health_at(np.array([travel[after] - travel[begin]]), rng)[0]
-            draws = np.log(np.maximum(health, _LEAST_HEALTH)).reshape(-1, len(words))
-            left += rng.choice(draws, len(left))
         again = restored(words, done)
+        if again < words.keys():
+            with suppress(LmshealthError, LinAlgError):
+                life = fit_life(history.first_logs(end), stage, seed, chains=False)
+                health = life.health_at(np.array([travel[after] - travel[begin]]), rng)[0]
+                draws = np.log(np.maximum(health, _LEAST_HEALTH)).reshape(-1, len(words))
+                left += rng.choice(draws, len(left))
         left[:, [name in again for name in words]] = 0.0
     return left if left.any() else None
 
@@ -458,7 +454,8 @@ def _past(made: Assessment, work: Maintenance) -> str:
     stated = {name: values[:n] for name, values in own.covariates.items()}
     rows = own.recorded_at[:n], own.travel[:n], own.ln_frequency[:n], own.cov[:n]
     steps = [(step.kind, step.first, step.source) for step in own.steps if step.first < n]
-    done = [(one.recorded_at, one.action) for one in work.actions if one.action in RESETS]
+    earlier = (one for one in work.actions if one.recorded_at <= own.recorded_at[n])
+    done = [(one.recorded_at, one.action) for one in earlier if one.action in RESETS]
     return fingerprint(own.logs[:n], made.digests[:n], rows, stated, own.baselines, steps, done)
 
 

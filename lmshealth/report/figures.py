@@ -253,10 +253,9 @@ def plot_life(ax: Axes, prognosis: Prognosis, parameter: str, *, baseline: float
     _levels(ax, limit)
     ax.axvline(now, color=INK, lw=1.2, ls=":", label=tr("now"))
     end = now + prognosis.horizon / _KM
-    low, middle, high = np.array(quantiles(prognosis.remaining[:, column], LEVELS)) / _KM
-    if np.isfinite(low) and low < prognosis.horizon / _KM:
-        ahead = np.array([low, middle, high])
-        ahead[ahead > end - now] = np.inf  # nothing is claimed there
+    ahead = np.array(quantiles(prognosis.censored()[:, column], LEVELS)) / _KM
+    low, _, high = ahead
+    if np.isfinite(low):
         _passage(ax, now, ahead, 100 * limit)
     right = min(end, now + max(1.3 * high, 0.25 * now)) if np.isfinite(high) else end
     if shown := right >= 0.55 * end:

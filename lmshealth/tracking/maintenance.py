@@ -70,8 +70,8 @@ NO_MAINTENANCE = Maintenance()
 
 def without_logs(actions: Iterable[Action], machines: Collection[str]) -> Iterator[str]:
     """Yield a sentence on each machine of actions that is none of these: it may be misspelt."""
+    written = {one.casefold(): one for one in machines}
     for name in dict.fromkeys(one.stage for one in actions if one.stage not in machines):
-        written = {one.casefold(): one for one in machines}
         near = get_close_matches(name.casefold(), written, 1)
         hint = f"; is it {written[near[0]]}?" if near else ""
         yield f"maintenance.csv: work on {name} is not used: no usable log is of it{hint}"

@@ -58,8 +58,8 @@ def all_of(p: Iterable[float]) -> Evidence:
 def covered(off: ArrayLike, factor: float = 1.0, share: float = 0.95) -> Evidence:
     """P value of the coverage of 95 % intervals, of errors in standard deviations.
 
-    The control is a ``factor`` on the width of the intervals. Intervals of another ``share``: of
-    95 % hold hardly fewer than those that are too wide, of 80 % many fewer.
+    The control is a ``factor`` on the width of the intervals. ``share`` is what they state: where
+    they are too wide those of 95 % hold hardly more, those of 80 % clearly more than that.
     """
     inside = np.abs(np.asarray(off)) < factor * float(stats.norm.isf((1 - share) / 2))
     return as_often(int(np.count_nonzero(inside)), inside.size, share)

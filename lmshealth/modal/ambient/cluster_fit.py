@@ -51,7 +51,7 @@ _MOST_SLOPES = 400_000
 _DOUBTFUL = 200.0
 # Shift by a coloured force, in standard deviations, from which on that for a white one counts.
 _FAR = 4.0
-# Change of ln ζ from the joint model of the band beyond which parts in quadrature are not believed.
+# Change of ln ζ from the joint model of the band beyond which parts in quadrature are left out.
 _OTHER_DAMPING = 0.5
 # The bins of a first fit resolve this part of the median bandwidth.
 _FINER = 2.0
