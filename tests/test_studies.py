@@ -49,14 +49,6 @@ def test_foreign_files(root: Path) -> None:
     assert answer["control"]["wrong"] == answer["control"]["files"] > 0
 
 
-def test_outside_faults(root: Path, needs: Callable[[str], None]) -> None:
-    """Faulty inputs are answered as is right for them, those without the fault are used."""
-    needs("data")
-    answer = json.loads(run_study(root, "studies.inputs.outside_faults.run"))
-    assert all(answer["passed"].values())
-    assert answer["cases"] > 10
-
-
 def test_modes_real(root: Path, needs: Callable[[str], None]) -> None:
     """Real records give what is known of them; what is not met is known to be."""
     needs("data")

@@ -62,7 +62,7 @@ PREDICTION_ORDER, PREDICTION_SAMPLES = 32, 1000
 LONGEST_FILLED = 16
 # Largest share of the power spectral density that errors of filled samples may have, at any
 # frequency: damping ratios of logs that are just filled are low by 1 %, less than their standard
-# deviation (`studies/inputs/outside_faults`).
+# deviation.
 FILLED_ERROR = 0.3
 # Standard deviations of the prediction error up to which samples beside a filled one are ordinary:
 # 10⁹ samples of normal noise stay below 6.2; a blow or a step exceeds it, and is not filled in.

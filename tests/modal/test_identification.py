@@ -993,6 +993,56 @@ def test_many_short_pieces_keep_the_damping(needs: Callable[[str], None]) -> Non
     assert abs(error) < 3 * modes.damping_ratio_std[upper] and modes.snr.max() < 1e5
 
 
+def _overflow(x: np.ndarray, bits: int, turns: float) -> np.ndarray:
+    """Let a counter overflow whose range is so many times too small."""
+    step = 2 * np.abs(x).max() / 2**bits / turns
+    half = 2 ** (bits - 1)
+    return ((np.round(x / step) + half) % (2 * half) - half) * step
+
+
+def _with_gaps(x: np.ndarray, share: float, length: int, seed: int) -> np.ndarray:
+    """Lose a share of the samples in gaps of a length."""
+    starts = rng(seed).integers(0, x.size - length, round(share * x.size / length))
+    lost = np.unique(starts[:, None] + np.arange(length))
+    return np.where(np.isin(np.arange(x.size), lost), np.nan, x)
+
+
+def _with_spikes(x: np.ndarray, seed: int) -> np.ndarray:
+    """Add thirty single bad samples."""
+    bad = rng(seed).choice(x.size, 30, replace=False)
+    return x + np.where(np.isin(np.arange(x.size), bad), 20.0, 0.0)
+
+
+@pytest.mark.parametrize(
+    ("reason", "damage"),
+    [
+        ("", lambda x, k: np.round(x / 1e-3) * 1e-3),
+        ("unwrapped", lambda x, k: x if k else _overflow(x, 16, 1.05)),
+        ("unwrapped", lambda x, k: x if k else _overflow(x, 12, 1.4)),
+        ("spikes", lambda x, k: _with_spikes(x, seed=k)),
+        ("gaps", lambda x, k: _with_gaps(x, 0.005, 1, seed=k)),
+        ("gaps", lambda x, k: _with_gaps(x, 0.03, 5, seed=0)),
+    ],
+    ids=["none", "few overflows", "many overflows", "bad samples", "single lost", "gaps of five"],
+)
+def test_faults_of_samples_are_named_and_leave_the_damping(
+    tmp_path: Path, reason: str, damage: Callable[[np.ndarray, int], np.ndarray]
+) -> None:
+    """A mode of 96 Hz and 2 % is within 3σ whatever happened to its samples, and that is named."""
+    mode = Mode(96.0, 0.02, 1.0, (1.0, -0.6))
+    clean = accelerations(rng(), [mode], 60_000, 2000.0, 0.1)
+    channels = {f"acc_{k}_m_s2": damage(x / x.std(), k) for k, x in enumerate(clean)}
+    path = tmp_path / "log.csv"
+    text = [",".join("nan" if np.isnan(x) else f"{x:.9g}" for x in row)
+            for row in zip(*channels.values(), strict=True)]  # fmt: skip
+    path.write_text("\n".join(["# sample_rate_hz: 2000", ",".join(channels), *text]))
+    log = read_log(path)
+    modes = identify(log, band=(60.0, 150.0))
+    (found,) = modes.damping_ratio
+    assert abs(found - 0.02) < 3 * modes.damping_ratio_std[0]
+    assert {refusal.reason for refusal in log.refused} == ({reason} if reason else set())
+
+
 # What a log carries decides how it is read.
 
 STRUCK = ((62.0, 0.02, 1.0), (105.0, 0.015, -0.7))

@@ -18,8 +18,8 @@ from lmshealth.io.column_map import ColumnMap
 from lmshealth.io.formats.content import describe, frequency_column
 from lmshealth.io.reading import read_log
 from lmshealth.stage.proposal import propose
-from studies.inputs.outside_faults.no_logs import LINES, NO_LOGS, NODES, sound, zipped
-from studies.inputs.outside_faults.no_logs import SAMPLES as X
+from tests.io.formats.no_logs import LINES, NO_LOGS, NODES, sound, zipped
+from tests.io.formats.no_logs import SAMPLES as X
 from tests.io.handmade import uff_set
 
 FREQUENCY = np.arange(X.size) / 2
