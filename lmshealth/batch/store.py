@@ -11,7 +11,7 @@ import hashlib
 import logging
 import time
 from collections import Counter
-from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -551,35 +551,23 @@ def cached(
     """
     store = resources.store
 
-    def compute(
-        pieces: Sequence[Piece],
-    ) -> Generator[tuple[Pairs[Piece, Value], bool], None, list[Piece]]:
-        """Compute the values of unclaimed pieces; return the other pieces."""
-        others, claimed = list[Piece](), dict[int, list[Piece]]()
+    def jobs(left: Sequence[Piece], claimed: dict[int, list[Piece]]) -> Iterator[Any]:
+        """Yield jobs of the pieces that this run can claim; ``claimed`` has these by a job's id."""
         # A few are spread over the workers.
-        size = min(most, max(1, len(pieces) // (4 * resources.pool.size)))
+        size = min(most, max(1, len(left) // (4 * resources.pool.size)))
+        for first in range(0, len(left), size):
+            part = {key(piece): piece for piece in left[first : first + size]}
+            own = store.claim([*part])
+            if store.is_divided:  # another run may have done it since this one began
+                done = {key(piece) for piece, _ in fetch([part[one] for one in part if one in own])}
+                store.release([*done])
+                own -= done
+            if mine := [piece for one, piece in part.items() if one in own]:
+                made = job(mine)
+                claimed[id(made)] = mine
+                yield made
 
-        def jobs() -> Iterator[Any]:
-            for first in range(0, len(pieces), size):
-                part = [(key(piece), piece) for piece in pieces[first : first + size]]
-                own = store.claim([one for one, _ in part])
-                if store.is_divided:  # another run may have done it since this one began
-                    done = {key(piece) for piece, _ in fetch([p for k, p in part if k in own])}
-                    store.release([*done])
-                    own -= done
-                others.extend(piece for one, piece in part if one not in own)
-                if mine := [piece for one, piece in part if one in own]:
-                    made = job(mine)
-                    claimed[id(made)] = mine
-                    yield made
-
-        for made, values in resources.pool.map_unordered(function, jobs(), on_crash):
-            mine = claimed.pop(id(made))
-            yield list(zip(mine, values, strict=True)), True
-            store.release([key(piece) for piece in mine])
-        return others
-
-    left, is_waiting = pieces, False
+    left, is_waiting = [*pieces], False
     while left:
         known = set[str]()
         for piece, value in fetch(left):
@@ -588,5 +576,12 @@ def cached(
         if is_waiting and not known:
             time.sleep(constants.OTHERS_POLL_S)
         left = [piece for piece in left if key(piece) not in known]
-        others = yield from compute(left)
-        left, is_waiting = others, len(others) == len(left)
+        claimed, computed = dict[int, list[Piece]](), set[str]()
+        for made, values in resources.pool.map_unordered(function, jobs(left, claimed), on_crash):
+            mine = claimed.pop(id(made))
+            yield list(zip(mine, values, strict=True)), True
+            own = [key(piece) for piece in mine]
+            store.release(own)
+            computed.update(own)
+        is_waiting = not computed
+        left = [piece for piece in left if key(piece) not in computed]
