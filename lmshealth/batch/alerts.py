@@ -155,11 +155,11 @@ def deliver(store: Store, machines: Sequence[Status], alerts: Alerts, out: Path)
 def write_statuses(machines: Sequence[Status], made: Container[str], out: Path) -> None:
     """Write the status of each machine and of all; those in ``made`` have a result in this run."""
     # Where the page of a machine that is gone has the name of another, that of this run is kept.
-    documents: list[tuple[str, Status | Fleet]] = [
-        (f"{Path(one.page).stem}.status.json", one)
-        for one in sorted(machines, key=lambda one: (one.stage in made, one.recorded_at))
-    ]
-    for name, document in (*documents, (FILE, Fleet(tuple(machines)))):
+    ordered = sorted(machines, key=lambda one: (one.stage in made, one.recorded_at))
+    documents: dict[str, Status | Fleet]
+    documents = {f"{Path(one.page).stem}.status.json": one for one in ordered}
+    documents[FILE] = Fleet(tuple(machines))
+    for name, document in documents.items():
         encoded = msgspec.json.encode(document, enc_hook=lambda number: number.item())
         write_bytes(out / name, msgspec.json.format(encoded, indent=1))
 
@@ -183,7 +183,6 @@ def run_command(command: Sequence[str], content: bytes) -> str:
             return f"{visible(command[0])} cannot be started: {error.strerror}"
 
     def keep_end(stream: IO[bytes]) -> None:
-        """Read up to the end, and keep the last bytes."""
         with stream:
             while block := os.read(stream.fileno(), 1 << 16):
                 last[:] = (last + block)[-constants.ALERT_OUTPUT_BYTES :]

@@ -8,8 +8,8 @@ import re
 import threading
 import time
 from collections import Counter
-from collections.abc import Callable, Container, Iterable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, closing
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, closing, suppress
 from dataclasses import dataclass, field, replace
 from datetime import UTC, date, datetime
 from functools import partial
@@ -22,7 +22,7 @@ import msgspec
 
 from lmshealth._private.files import remove_abandoned, replacing, write_text
 from lmshealth._private.serialize import VERSION, fingerprint, pack, unpack
-from lmshealth._private.tables import RUN_TABLES
+from lmshealth._private.tables import RUN_TABLES, Row
 from lmshealth.batch import constants
 from lmshealth.batch.alerts import FILE as STATUSES
 from lmshealth.batch.alerts import Scope, announce, deliver, last_number, write_statuses
@@ -30,7 +30,6 @@ from lmshealth.batch.assess import Machine, apply_fleet_priors, assess_all, reas
 from lmshealth.batch.ingest import Ingested, Settings, ingest
 from lmshealth.batch.store import (
     PackedLogs,
-    Published,
     Resources,
     Store,
     cached,
@@ -100,22 +99,22 @@ def machine_output(record: MachineRecord) -> MachineOutput | None:
     status = make_status(found, summary)
     with _DRAWING, in_language(record.language):
         page = make_page(found, summary, before=record.before)
-    rows = machine_tables(found, summary) if logs else {}
-    tables = {name: csv_text(name, own) for name, own in rows.items()} | _tables_of_logs(logs)
     return MachineOutput(
         page=page,
         summary=summary,
-        tables={name: pack(text) for name, text in tables.items()},
+        tables=_packed(machine_tables(found, summary) if logs else {}, logs),
         excluded=tuple(r.log for r in found.refused if r.reason in LEFT_OUT),
         status=status,
     )
 
 
-def _tables_of_logs(logs: Sequence[LogEstimates]) -> dict[str, str]:
-    """Return the tables of the logs of a machine as CSV, by name."""
+def _packed(rows: dict[str, list[Row]], logs: Sequence[LogEstimates] = ()) -> dict[str, bytes]:
+    """Return tables as packed CSV, by name: of rows, and those of logs."""
     of_logs = [log_tables(one) for one in sort_by_time(logs)]
     names = of_logs[0] if of_logs else ()
-    return {name: "".join(join_csv([one[name] for one in of_logs])) for name in names}
+    tables = {name: csv_text(name, own) for name, own in rows.items()}
+    tables |= {name: "".join(join_csv([one[name] for one in of_logs])) for name in names}
+    return {name: pack(text) for name, text in tables.items()}
 
 
 @dataclass(frozen=True, slots=True)
@@ -265,7 +264,7 @@ def run(
             found = announce(store, present, judging.today, settings.alerts, scope)
             statuses, changes, notes = found
             of_run = {"refused": refused_rows(refused), "changes": msgspec.to_builtins(changes)}
-            tables[""] = {name: pack(csv_text(name, own)) for name, own in of_run.items()}
+            tables[""] = _packed(of_run)
             write_tables(out, [machine.name for machine in machines], tables)
         with in_language(settings.language):
             gone = [one for one in statuses if one.stage not in ingested.machines]
@@ -325,8 +324,12 @@ def report(
     """
     out = Path(out)
     _prepare(out)
-    announced = store.announced()
-    present = _present(store, announced)
+    announced, published = store.announced(), store.published()
+    # What was announced of a machine that is retired was deleted, but not that of the others of its
+    # folder, which have one list of refused logs with it. With damage it is not known of which.
+    folders = {one.refused for one in published if one.machine in announced}
+    known = folders if not store.damaged["announced"] else ()
+    present = [one for one in published if one.machine in announced or one.refused not in known]
     files = file_names([one.machine for one in present])
     rows, failed = dict[str, Summary](), dict[str, str]()
     progress("reporting", 0, len(present))
@@ -358,19 +361,6 @@ def report(
         failed={one.machine: unread for one in present if one.machine not in rows} | failed,
         notes=tuple(store.notes),
     )
-
-
-def _present(store: Store, announced: Container[str]) -> list[Published]:
-    """List the published assessments without those of machines that are retired.
-
-    The row of what was announced of such a machine was deleted; other machines of its folder, which
-    have one list of refused logs with it, have theirs.
-    """
-    published = store.published()
-    if store.damaged["announced"]:  # it is not known of which machines
-        return list(published)
-    folders = {one.refused for one in published if one.machine in announced}
-    return [one for one in published if one.machine in announced or one.refused not in folders]
 
 
 def _judging(settings: Settings = Settings()) -> Judging:
@@ -499,9 +489,8 @@ def _tables(
 
     def of_logs(machine: Machine) -> dict[str, bytes]:
         logs = unpack_logs(store.packed_logs(machine.logs))
-        rows = refused_rows([own for one in logs for own in one.modes.refused])
-        texts = {"refused": csv_text("refused", rows), **_tables_of_logs(logs)}
-        return {name: pack(text) for name, text in texts.items()}
+        refused = [own for one in logs for own in one.modes.refused]
+        return _packed({"refused": refused_rows(refused)}, logs)
 
     for machine in machines:
         if machine.name not in made:
@@ -610,13 +599,10 @@ def _files(folder: Path, out: Path) -> _Files:
     inside = out.resolve()
     for parent, folders, files in os.walk(folder.absolute()):
         here = Path(parent)
-        folders[:] = [
-            name for name in folders if name[0] != "." and (here / name).resolve() != inside
-        ]
+        visited = [name for name in folders if name[0] != "."]
+        folders[:] = [name for name in visited if (here / name).resolve() != inside]
         for path in (here / name for name in files if name[0] != "."):
-            try:
+            with suppress(OSError):  # removed meanwhile
                 seen = path.stat()
-            except OSError:  # removed meanwhile
-                continue
-            found[path] = seen.st_size, seen.st_mtime_ns
+                found[path] = seen.st_size, seen.st_mtime_ns
     return found

@@ -189,9 +189,8 @@ class Store:
         with self._faults():
             tables = sql.inspect(self._engine).get_table_names()
         if VALUES.name not in tables:
-            found = "no results"
-            if database.is_older(tables):
-                found = "only results of another version of lmshealth"
+            older = "only results of another version of lmshealth"
+            found = older if database.is_older(tables) else "no results"
             self.close()
             raise self.unfilled(f"{found} (no table {VALUES.name})")
 
@@ -411,8 +410,7 @@ class Store:
             rows = connection.execute(query).all()
         found = list[tuple[str, bytes]]()
         for owner, key, stored in rows:
-            content = _unsealed(stored, kind, owner, key)
-            if content is not None:
+            if (content := _unsealed(stored, kind, owner, key)) is not None:
                 found.append((key, content))
                 continue
             self.damaged[kind] += 1
@@ -508,9 +506,8 @@ def _unsealed(stored: Any, *place: Any) -> bytes | None:
 
 def _seal(content: bytes, *place: Any) -> bytes:
     subject = "\0".join(map(str, place)).encode("utf-8", "surrogatepass")
-    return hashlib.blake2b(
-        content, digest_size=_SEAL_BYTES, key=hashlib.sha256(subject).digest()
-    ).digest()
+    key = hashlib.sha256(subject).digest()
+    return hashlib.blake2b(content, digest_size=_SEAL_BYTES, key=key).digest()
 
 
 # Cached functions
