@@ -6,15 +6,15 @@ way. ``status.json`` is a view of it.
 
 import os
 import signal
-import subprocess
 import sys
-from collections.abc import Container, Mapping, Sequence
+from collections.abc import Container, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import date
 from pathlib import Path, PurePath
+from subprocess import PIPE, STDOUT, Popen, TimeoutExpired
 from tempfile import TemporaryFile
 from threading import Thread
-from typing import IO, Any, NamedTuple
+from typing import IO, NamedTuple
 
 import msgspec
 
@@ -22,7 +22,7 @@ from lmshealth._private.files import read_table, write_bytes
 from lmshealth._private.serialize import pack
 from lmshealth.batch import constants
 from lmshealth.batch.store import Announced, Store, Unsent, machine_key
-from lmshealth.io.refusal import shown, visible
+from lmshealth.io.refusal import visible
 from lmshealth.machine.constants import JSON_SCHEMA
 from lmshealth.machine.status import Change, Fleet, Status, compare
 
@@ -43,27 +43,21 @@ class Alerts:
 
     def channels(self) -> dict[str, tuple[str, ...]]:
         """Return the commands to run, by the option that asked for each."""
-        asked = {"--alert-command": self.command}
-        asked["--notify"] = (sys.executable, *_NOTIFY) if self.notify else ()
-        return {name: command for name, command in asked.items() if command}
+        asked = {"--alert-command": self.command} if self.command else {}
+        return asked | ({"--notify": (sys.executable, *_NOTIFY)} if self.notify else {})
 
 
 class Scope(NamedTuple):
-    """Folders of the logs and of the output of a run, and the `last_number` as it began."""
+    """Folder of the logs of a run as the store has it, that of the output, `last_number` before."""
 
-    logs: Path
+    logs: str
     out: Path
     began: int
 
-    @property
-    def folder(self) -> str:
-        """Folder of the logs, as the store has it."""
-        return shown(os.path.abspath(self.logs))
 
-
-def last_number(store: Store) -> int:
+def last_number(announced: Iterable[Announced]) -> int:
     """Return the number of the last comparison on a store; 0 without one."""
-    return max((one.number for one in store.announced().values()), default=0)
+    return max((one.number for one in announced), default=0)
 
 
 def announce(
@@ -75,50 +69,52 @@ def announce(
     store without any of them takes ``status.json`` for what was announced. Only within
     `Store.alone`; return statuses, changes, and notes of damage.
     """
-    unsent, everything = store.unsent(), store.announced()
-    folder, notes = scope.folder, list[str]()
-    inside = {k for k, one in everything.items() if PurePath(one.folder).is_relative_to(folder)}
-    own = {stage: one for stage, one in everything.items() if stage in inside | made.keys()}
+    unsent, everything, notes = store.unsent(), store.announced(), list[str]()
+    own = {
+        stage: one
+        for stage, one in everything.items()
+        if stage in made or PurePath(one.folder).is_relative_to(scope.logs)
+    }
     known = {stage: one.status for stage, one in own.items()}
+    written = Fleet()
     try:
         written = msgspec.json.decode(read_table(scope.out / FILE), type=Fleet)
     except FileNotFoundError:
-        written = Fleet()
+        pass
     except (OSError, ValueError) as error:
-        written, step = Fleet(), "written anew from the store"
+        step = "written anew from the store"
         if not known:
             step = "the store has no status either: losses, alarms and silences are announced again"
         notes.append(f"{scope.out / FILE} cannot be read ({error}); {step}")
     last_run = {one.stage: one for one in written.machines}
     lost_change, lost_status = (store.damaged[name] for name in ("unsent", "announced"))
-    present = known | dict(made) if known and not lost_status else last_run | known | dict(made)
+    present = ({} if known and not lost_status else last_run) | known | dict(made)
     if lost_change:  # it is not known which one: what is bad now is announced again
         known = {}
     elif not lost_status:
         known = known or last_run
     asked = set(alerts.channels())
     everywhere = asked.union(*(one.channels for one in own.values()))
-    number = 1 + max((one.number for one in everything.values()), default=0)
-    announced, changes, queued = [], list[Change](), list[Unsent]()
+    number = 1 + last_number(everything.values())
+    statuses, changes = list[Status](), list[Change]()
     for stage, status in sorted(present.items()):
         last = own.get(stage)
+        before = set(last.channels if last else ())
         judged, found = compare(known.get(stage), status, today, alerts.silent_days)
         if last and last.number > scope.began and status.recorded_at < last.status.recorded_at:
             # Another run, of later logs, has ended since this one began.
             judged, found = last.status, []
-        channels = asked.union(last.channels) if last else everywhere
-        new = channels.difference(last.channels if last else ())
-        waiting = {one.change: None for one in unsent if one.change.stage == stage}
-        queued += [Unsent(one, name, number) for name in new for one in waiting]
+        channels = asked | before if last else everywhere
+        waiting = dict.fromkeys(one.change for one in unsent if one.change.stage == stage)
+        queued = [Unsent(one, name, number) for name in channels - before for one in waiting]
         queued += [Unsent(one, name, number) for name in channels for one in found]
+        place = last.folder if last and stage not in made else scope.logs
+        announced = Announced(judged, place, tuple(sorted(channels)), number)
+        store.put("announced", {"": pack(announced)}, stage)
+        store.put("unsent", {one.key: pack(one) for one in queued}, stage)
+        statuses.append(judged)
         changes += found
-        place = folder if stage in made or not last else last.folder
-        announced.append(Announced(judged, place, tuple(sorted(channels)), number))
-    for last in announced:
-        store.put("announced", {"": pack(last)}, last.status.stage)
-    for waits in queued:
-        store.put("unsent", {waits.key: pack(waits)}, waits.change.stage)
-    return tuple(one.status for one in announced), changes, notes
+    return tuple(statuses), changes, notes
 
 
 def deliver(store: Store, machines: Sequence[Status], alerts: Alerts, out: Path) -> dict[str, str]:
@@ -138,33 +134,32 @@ def deliver(store: Store, machines: Sequence[Status], alerts: Alerts, out: Path)
             continue
         with store.alone():
             unsent = waiting(name)  # another run may have delivered some meanwhile
-            rows = [_row(one.change, by_stage[one.change.stage], out) for one in unsent]
+            rows = [
+                msgspec.to_builtins(one.change)
+                | {"text": str(one.change), "DeviceHealth": status.device_health}
+                | {"page": str(out.absolute() / status.page)}
+                for one in unsent
+                for status in [by_stage[one.change.stage]]
+            ]
             content = {"schema": JSON_SCHEMA, "changes": rows}
             why = run_command(command, msgspec.json.encode(content)) if rows else ""
             if why:
                 again = "are sent again by the next run with this option"
                 failed[name] = f"{why}; {len(rows)} changes {again}"
-            else:
-                for one in unsent:
-                    store.remove("unsent", machine_key(one.change.stage), one.key)
+                continue
+            for one in unsent:
+                store.remove("unsent", machine_key(one.change.stage), one.key)
     return failed
-
-
-def _row(change: Change, status: Status, out: Path) -> dict[str, Any]:
-    """Return a change as an alert has it."""
-    row: dict[str, Any] = msgspec.to_builtins(change)
-    page = str(out.absolute() / status.page)
-    return row | {"text": str(change), "DeviceHealth": status.device_health, "page": page}
 
 
 def write_statuses(machines: Sequence[Status], made: Container[str], out: Path) -> None:
     """Write the status of each machine and of all; those in ``made`` have a result in this run."""
     # Where the page of a machine that is gone has the name of another, that of this run is kept.
-    documents: list[tuple[str, Status | Fleet]] = [
-        (f"{Path(one.page).stem}.status.json", one)
-        for one in sorted(machines, key=lambda one: (one.stage in made, one.recorded_at))
-    ]
-    for name, document in (*documents, (FILE, Fleet(tuple(machines)))):
+    ordered = sorted(machines, key=lambda one: (one.stage in made, one.recorded_at))
+    documents: dict[str, Status | Fleet]
+    documents = {f"{Path(one.page).stem}.status.json": one for one in ordered}
+    documents[FILE] = Fleet(tuple(machines))
+    for name, document in documents.items():
         encoded = msgspec.json.encode(document, enc_hook=lambda number: number.item())
         write_bytes(out / name, msgspec.json.format(encoded, indent=1))
 
@@ -181,13 +176,13 @@ def run_command(command: Sequence[str], content: bytes) -> str:
         given.write(content)
         given.seek(0)
         try:
-            to: dict[str, Any] = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT}
-            process = subprocess.Popen(command, stdin=given, start_new_session=True, **to)
+            process = Popen(
+                command, stdin=given, stdout=PIPE, stderr=STDOUT, start_new_session=True
+            )
         except OSError as error:
             return f"{visible(command[0])} cannot be started: {error.strerror}"
 
     def keep_end(stream: IO[bytes]) -> None:
-        """Read up to the end, and keep the last bytes."""
         with stream:
             while block := os.read(stream.fileno(), 1 << 16):
                 last[:] = (last + block)[-constants.ALERT_OUTPUT_BYTES :]
@@ -196,7 +191,7 @@ def run_command(command: Sequence[str], content: bytes) -> str:
     reader.start()
     try:
         status = process.wait(constants.ALERT_TIMEOUT_S)
-    except subprocess.TimeoutExpired:
+    except TimeoutExpired:
         return f"took longer than {constants.ALERT_TIMEOUT_S} s, and was killed"
     finally:
         if process.poll() is None:

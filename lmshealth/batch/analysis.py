@@ -81,18 +81,17 @@ def analyse(
     refused, found = [*given.refused], list[LogEstimates]()
     seen: dict[str, tuple[str, dict[str, str]]] = {}
     for one in given.logs:
-        overrides: dict[str, str] = {}
+        overrides, is_declared, log = dict[str, str](), False, one
         try:
-            log = one
             if isinstance(log, Path):
-                overrides = given.manifests[log].overrides(log)
+                manifest = given.manifests[log]
+                is_declared, overrides = manifest.is_baseline(log), manifest.overrides(log)
                 log = read_log(log, columns=used, overrides=overrides, latest=latest)
             if log.digest in seen:
                 raise copy_error(log.name, overrides, *seen[log.digest])
             seen[log.digest] = log.name, overrides
             found.append(_estimates(log, stage))
         except BadLog as error:
-            is_declared = isinstance(one, Path) and given.manifests[one].is_baseline(one)
             machine = log.metadata.stage if isinstance(log, Log) else overrides.get("stage")
             refusal = Refusal(error.log, error.reason, error.detail, baseline=is_declared)
             refused.append(replace(refusal, machine=machine or ""))
@@ -152,10 +151,9 @@ def _with_refusals(made: Assessment, refused: Sequence[Refusal], work: Maintenan
     """Add refusals of logs and rows, and notices of those that concern the machine."""
     machine = made.history.stage
     mine = [one for one in refused if one.machine in ("", machine)]
-    instead = baseline_notices(mine, made.history.logs[made.history.baseline])
-    for note in without_logs(work.actions, [machine]):
-        instead.append(Notice("maintenance-unused", "caution", "maintenance.csv", note))
-    logs_lost = (one for one in mine if Path(one.log).name not in NOT_LOGS)
-    lost = tuple(one for one in logs_lost if one.reason not in NO_LOSS)
-    notices = (*made.notices, *instead)
-    return replace(made, lost=lost, refused=(*refused, *made.refused), notices=notices)
+    notices = [*made.notices, *baseline_notices(mine, made.history.logs[made.history.baseline])]
+    unused = without_logs(work.actions, [machine])
+    notices += [Notice("maintenance-unused", "caution", "maintenance.csv", one) for one in unused]
+    of_logs = (one for one in mine if Path(one.log).name not in NOT_LOGS)
+    lost = tuple(one for one in of_logs if one.reason not in NO_LOSS)
+    return replace(made, lost=lost, refused=(*refused, *made.refused), notices=tuple(notices))

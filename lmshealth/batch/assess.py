@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Container, Iterator, Sequence
-from concurrent.futures import CancelledError
 from dataclasses import dataclass, replace
-from typing import TypeVar
+from typing import Any, TypeVar
 
 from lmshealth._private.serialize import VERSION, fingerprint, pack
 from lmshealth.batch.ingest import unexpected
@@ -59,10 +58,10 @@ class Machine:
         inputs = self.logs, self.stage.digest, self.work, self.epochs, self.seed
         return fingerprint(VERSION, *inputs)
 
-
-def _life_key(stage: Stage, seed: int) -> str:
-    """Return the key of the part of an assessment that the next one begins with."""
-    return fingerprint(VERSION, "life", stage.digest, seed)
+    @property
+    def life_key(self) -> str:
+        """Key of the part of its assessment that the next one begins with."""
+        return fingerprint(VERSION, "life", self.stage.digest, self.seed)
 
 
 def assess_all(
@@ -70,8 +69,7 @@ def assess_all(
 ) -> dict[str, str]:
     """Assess every machine whose assessment is not in the store; with ``force``, every machine.
 
-    No part of an earlier assessment is used then. Return the machines that could not be assessed,
-    and why: one must not end the batch.
+    No part of an earlier assessment is used then. Return why some machines could not be assessed.
     """
     store, failed = resources.store, dict[str, str]()
 
@@ -80,15 +78,12 @@ def assess_all(
 
     def job(part: Sequence[Machine]) -> _Job:
         [one] = part
-        key = _life_key(one.stage, one.seed)
-        known = None if force else store.part(one.name, key, after=one.key)
+        known = None if force else store.part(one.name, one.life_key, after=one.key)
         return one, store.packed_logs(one.logs), known
 
-    def key(one: Machine) -> str:
-        return fingerprint(one.name, one.key)
-
     resources.progress("assessing", 0, len(machines))
-    found = cached(_assess_packed, machines, resources, key=key, fetch=fetch, job=job)
+    how: Any = {"key": lambda one: fingerprint(one.name, one.key), "fetch": fetch, "job": job}
+    found = cached(_assess_packed, machines, resources, **how)
     for k, ([(machine, made)], _) in enumerate(found, start=1):
         if isinstance(made, PackedAssessment):
             store.put_assessment(machine.name, machine.key, made)
@@ -105,17 +100,17 @@ def pack_assessment(assessment: Assessment) -> PackedAssessment:
 
 
 def _assess_packed(job: _Job) -> list[PackedAssessment | str | None]:
-    """Assess a machine, or return why it fails; raise what workers fail of."""
+    """Assess a machine, or return why it fails."""
     machine, logs, known = job
 
     def work() -> PackedAssessment:
         readings, before = unpack_logs(logs), unpack_or_none(known, LifeState)
         how = {"epochs": machine.epochs, "seed": machine.seed}
         found, after = assess_from(readings, machine.stage, machine.work, **how, before=before)
-        parts = {} if after is None else {_life_key(machine.stage, machine.seed): pack(after)}
+        parts = {} if after is None else {machine.life_key: pack(after)}
         return replace(pack_assessment(found), parts=parts)
 
-    return [reason_if_failed(work, machine.name, (CancelledError,))]
+    return [reason_if_failed(work, machine.name)]
 
 
 def apply_fleet_priors(
@@ -139,9 +134,10 @@ def apply_fleet_priors(
         return ((one, None) for one in of_part if store.has_assessment(one[0].name, one[1]))
 
     def job(part: Sequence[_Update]) -> _UpdateJob:
-        [one] = part
-        name, life_key = one[0].name, _life_key(one[0].stage, one[0].seed)
-        return one, store.get("assessed", one[0].key, name), store.part(name, life_key)
+        [update] = part
+        one = update[0]
+        content = store.get("assessed", one.key, one.name)
+        return update, content, store.part(one.name, one.life_key)
 
     found = cached(_update, updates, resources, key=lambda one: one[1], fetch=fetch, job=job)
     for k, ([(one, made)], is_new) in enumerate(found, start=1):
@@ -199,14 +195,10 @@ def _update(job: _UpdateJob) -> list[PackedAssessment | str | None]:
     return [reason_if_failed(work, machine.name)]
 
 
-def reason_if_failed(
-    work: Callable[[], Part], machine: str, raised: tuple[type[BaseException], ...] = ()
-) -> Part | str:
-    """Return the result of work for a machine, or why it fails; raise only certain exceptions."""
+def reason_if_failed(work: Callable[[], Part], machine: str) -> Part | str:
+    """Return the result of work for a machine, or why it fails: one must not end the batch."""
     try:
         return work()
-    except raised:
-        raise
     except LmshealthError as error:
         return str(error).removeprefix(f"{machine}: ")  # those who list it name the machine
     except Exception as error:

@@ -83,17 +83,18 @@ class Settings:
             is_whole = isinstance(value, Integral) and not isinstance(value, bool)
             needed = f"a whole number of at least {least}"
             check(name, value, is_whole and least <= value < 1 << 63, needed)
-        silent = self.alerts.silent_days
         positive = {"max_memory": self.max_memory, "seconds_per_log": self.seconds_per_log}
-        for name, value in (positive | {"silent_days": 1 if silent is None else silent}).items():
-            is_positive = isinstance(value, Real) and value > 0
-            check(name, value, is_positive, "a number above 0")
-        latest, today, is_map = self.latest, self.today, isinstance(self.columns, ColumnMap | None)
+        if self.alerts.silent_days is not None:
+            positive["silent_days"] = self.alerts.silent_days
+        for name, value in positive.items():
+            check(name, value, isinstance(value, Real) and value > 0, "a number above 0")
+        latest, today = self.latest, self.today
         is_zoned = latest is None or (isinstance(latest, datetime) and latest.tzinfo is not None)
         check("latest", latest, is_zoned, "a moment with a time zone")
         is_day = isinstance(today, date | None) and not isinstance(today, datetime)
         check("today", today, is_day, "a day (datetime.date)")
         check("language", self.language, self.language in LANGUAGES, f"one of {LANGUAGES}")
+        is_map = isinstance(self.columns, ColumnMap | None)
         check("columns", self.columns, is_map, "a result of column_map")
 
     def pool(self) -> AbstractContextManager[Pool]:
@@ -142,7 +143,7 @@ class _Outcome(NamedTuple):
     packed: bytes | None = None  # by the worker, if it is to be stored
 
     @classmethod
-    def of(cls, task: _Task, found: Identified, *, is_new: bool) -> Self:
+    def of(cls, task: _Task, found: Identified, *, is_new: bool = True) -> Self:
         """Make it from an outcome."""
         refused, recording = tuple[Refusal, ...](), ""
         if isinstance(found.outcome, LogEstimates):
@@ -179,13 +180,11 @@ def ingest(
     how = {"max_memory": settings.max_memory, "latest": settings.latest}
     limit = settings.seconds_per_log
     identify = partial(_identify_logs, stages=tuple(stages), how=how, limit=limit)
-
     fetch = partial(_cached, stages=stages, store=store, latest=settings.latest)
     n_cached = done = 0
     progress("identifying", 0, len(tasks))
     for part, is_new in _identified(tasks, identify, resources, fetch):
-        packed = {one.key[1]: one.packed for one in part if one.packed is not None}
-        store.put("identified", packed)
+        store.put("identified", {one.key[1]: one.packed for one in part if one.packed is not None})
         for one in part:
             lost += one.refused
             owners[one.key[0]] = one.machine or owners.get(one.key[0])
@@ -355,8 +354,8 @@ def _cached(
             found.outcome.metadata.recorded_at, latest
         )
         if found.description in ("", _none_of(stages), used) and not is_late:
-            outcome = _Outcome.of(own[key], found.renamed(own[key].name), is_new=False)
-            yield own[key], outcome
+            task = own[key]
+            yield task, _Outcome.of(task, found.renamed(task.name), is_new=False)
 
 
 def _matching(stages: Sequence[Stage], metadata: Metadata) -> Stage | None:
@@ -392,16 +391,19 @@ def _identified(
 def _crashed(tasks: Sequence[_Task], why: str) -> list[_Outcome]:
     needed = "no other log is affected; run again with fewer --workers"
     detail = f"{why} (crash or out of memory); {needed}"
-    ends = [(task, Refusal(task.name, "crashed", detail)) for task in tasks]
-    return [_Outcome.of(task, Identified((end,), lasting=False), is_new=True) for task, end in ends]
+    return [_Outcome.of(task, _passing(task, "crashed", detail)) for task in tasks]
+
+
+def _passing(task: _Task, reason: str, detail: str) -> Identified:
+    """Return a refusal that is no property of the log: the next run tries it again."""
+    return Identified((Refusal(task.name, reason, detail),), lasting=False)
 
 
 def _identify_logs(
     tasks: Sequence[_Task], stages: tuple[Stage, ...], how: Mapping[str, Any], limit: float
 ) -> list[_Outcome]:
     """Read and identify logs, and pack their outcomes where these are to be stored."""
-    found = (identify_log(task, stages, how, limit) for task in tasks)
-    return [_Outcome.of(task, one, is_new=True) for task, one in zip(tasks, found, strict=True)]
+    return [_Outcome.of(task, identify_log(task, stages, how, limit)) for task in tasks]
 
 
 def _within(limit: float, name: str) -> Callable[[str, int, int], None]:
@@ -461,12 +463,10 @@ def identify_log(
         return Identified((refusal,), by, stage, asked, lasting=lasting)
     except (OSError, MemoryError) as error:
         why = visible(str(error)) or type(error).__name__
-        detail = f"{why}: the computer failed, not the log; run again"
-        return Identified((Refusal(task.name, "resources", detail),), lasting=False)
+        return _passing(task, "resources", f"{why}: the computer failed, not the log; run again")
     except Exception as error:  # an error of this program in one log must not end the batch
         _logger.exception("%s", task.name)
-        detail = unexpected(error, "the log")
-        return Identified((Refusal(task.name, "internal", detail),), lasting=False)
+        return _passing(task, "internal", unexpected(error, "the log"))
 
 
 def unexpected(error: Exception, attachment: str) -> str:

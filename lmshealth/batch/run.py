@@ -8,8 +8,8 @@ import re
 import threading
 import time
 from collections import Counter
-from collections.abc import Callable, Container, Iterable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, closing
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, closing, suppress
 from dataclasses import dataclass, field, replace
 from datetime import UTC, date, datetime
 from functools import partial
@@ -22,20 +22,14 @@ import msgspec
 
 from lmshealth._private.files import remove_abandoned, replacing, write_text
 from lmshealth._private.serialize import VERSION, fingerprint, pack, unpack
-from lmshealth._private.tables import RUN_TABLES
+from lmshealth._private.tables import RUN_TABLES, Row
 from lmshealth.batch import constants
 from lmshealth.batch.alerts import FILE as STATUSES
 from lmshealth.batch.alerts import Scope, announce, deliver, last_number, write_statuses
-from lmshealth.batch.assess import (
-    Machine,
-    apply_fleet_priors,
-    assess_all,
-    reason_if_failed,
-)
+from lmshealth.batch.assess import Machine, apply_fleet_priors, assess_all, reason_if_failed
 from lmshealth.batch.ingest import Ingested, Settings, ingest
 from lmshealth.batch.store import (
     PackedLogs,
-    Published,
     Resources,
     Store,
     cached,
@@ -47,7 +41,7 @@ from lmshealth.batch.workers import Progress
 from lmshealth.errors import LmshealthError, NothingUsable
 from lmshealth.io.log import Refusal
 from lmshealth.io.manifest import MANIFEST, MISSPELT, NOT_LOGS
-from lmshealth.io.refusal import listed, visible
+from lmshealth.io.refusal import listed, shown, visible
 from lmshealth.machine.assessment import Assessment
 from lmshealth.machine.status import Change, Status, judge_on, make_status, on_day
 from lmshealth.machine.summary import Summary, summarise
@@ -57,11 +51,7 @@ from lmshealth.report.pages import by_urgency, date_page, file_names, make_page,
 from lmshealth.report.tables import csv_text, join_csv, log_tables, machine_tables, refused_rows
 from lmshealth.stage.description import Stage, expect_stages
 from lmshealth.tracking.contradictions import LEFT_OUT, sort_by_time
-from lmshealth.tracking.maintenance import (
-    baseline_notices,
-    read_maintenance,
-    without_logs,
-)
+from lmshealth.tracking.maintenance import baseline_notices, read_maintenance, without_logs
 
 # Output of one machine
 
@@ -109,23 +99,22 @@ def machine_output(record: MachineRecord) -> MachineOutput | None:
     status = make_status(found, summary)
     with _DRAWING, in_language(record.language):
         page = make_page(found, summary, before=record.before)
-    rows = machine_tables(found, summary) if logs else {}
-    tables = {name: csv_text(name, own) for name, own in rows.items()}
-    tables |= _tables_of_logs(logs)
     return MachineOutput(
         page=page,
         summary=summary,
-        tables={name: pack(text) for name, text in tables.items()},
+        tables=_packed(machine_tables(found, summary) if logs else {}, logs),
         excluded=tuple(r.log for r in found.refused if r.reason in LEFT_OUT),
         status=status,
     )
 
 
-def _tables_of_logs(logs: Sequence[LogEstimates]) -> dict[str, str]:
-    """Return the tables of the logs of a machine as CSV, by name."""
+def _packed(rows: dict[str, list[Row]], logs: Sequence[LogEstimates] = ()) -> dict[str, bytes]:
+    """Return tables as packed CSV, by name: of rows, and those of logs."""
     of_logs = [log_tables(one) for one in sort_by_time(logs)]
     names = of_logs[0] if of_logs else ()
-    return {name: "".join(join_csv([one[name] for one in of_logs])) for name in names}
+    tables = {name: csv_text(name, own) for name, own in rows.items()}
+    tables |= {name: "".join(join_csv([one[name] for one in of_logs])) for name in names}
+    return {name: pack(text) for name, text in tables.items()}
 
 
 @dataclass(frozen=True, slots=True)
@@ -159,8 +148,8 @@ def write_tables(
 ) -> None:
     """Replace the tables of a run, all at its end: an interrupted run leaves those before.
 
-    Of some machines there are packed tables by name; those of no machine (``""``) come first.
-    `BadTable` if a table cannot be written.
+    ``tables`` are packed, by machine and name; those of no machine (``""``) come first. `BadTable`
+    if one cannot be written.
     """
     parts = [tables[machine] for machine in ("", *machines) if machine in tables]
     with ExitStack() as stack:
@@ -249,16 +238,15 @@ def run(
     {'roll': 'not-excited', 'pitch': 'not-excited', 'yaw': 'not-excited'}
     """
     folder, out = Path(folder), Path(out)
-    if folder.absolute().resolve().is_relative_to(out.resolve()):
-        step = "name another folder, which may be inside of it"
-        raise LmshealthError(
-            f"{out}: contains the logs, and no file of the output is a log; {step}"
-        )
+    if folder.resolve().is_relative_to(out.resolve()):
+        why = "contains the logs, and no file of the output is a log"
+        raise LmshealthError(f"{out}: {why}; name another folder, which may be inside of it")
     expect_stages(stages)
     _prepare(out)
     work = read_maintenance(folder, follow_links=settings.follow_links, latest=settings.latest)
     with settings.pool() as pool, closing(Store(settings.store or default_url(out))) as store:
-        scope = Scope(folder, out, last_number(store))
+        place = shown(os.path.abspath(folder))
+        scope = Scope(place, out, last_number(store.announced().values()))
         resources = Resources(store, pool, progress)
         ingested = ingest(folder, stages, resources, out=out, settings=settings)
         refused = (*ingested.refused, *(one.refusal for one in work.unread))
@@ -269,15 +257,14 @@ def run(
         failed = assess_all(machines, resources)
         usable = [machine for machine in machines if machine.name not in failed]
         judging = _judging(settings)
-        rows, lacking, made = _report(usable, refused, resources, out, judging, scope.folder)
+        rows, lacking, made = _report(usable, refused, resources, out, judging, place)
         present = {name: output.status for name, output in made.items()}
         tables = _tables(machines, made, store)
         with store.alone():  # a run that ends before its tables are written has announced nothing
             found = announce(store, present, judging.today, settings.alerts, scope)
             statuses, changes, notes = found
-            changed = [msgspec.to_builtins(change) for change in changes]
-            of_run = {"refused": refused_rows(refused), "changes": changed}
-            tables[""] = {name: pack(csv_text(name, own)) for name, own in of_run.items()}
+            of_run = {"refused": refused_rows(refused), "changes": msgspec.to_builtins(changes)}
+            tables[""] = _packed(of_run)
             write_tables(out, [machine.name for machine in machines], tables)
         with in_language(settings.language):
             gone = [one for one in statuses if one.stage not in ingested.machines]
@@ -288,7 +275,7 @@ def run(
         notes += _of_names(ingested.machines, [one.stage for one in statuses])
     counts, lost = _count(ingested, refused, made)
     if not machines:
-        why = _none_usable(folder, ingested.logs, refused, lost)
+        why = f"{folder}: no usable log: {_none_usable(folder, ingested.logs, refused, lost)}"
         failed_alerts = "".join(f"; {name}: {reason}" for name, reason in unsent.items())
         raise NothingUsable(f"{why}; {out / 'refused.csv'} lists all{failed_alerts}")
     misspelt = tuple(f"{one.log}: {one.detail}" for one in refused if one.reason == MISSPELT)
@@ -337,8 +324,12 @@ def report(
     """
     out = Path(out)
     _prepare(out)
-    announced = store.announced()
-    present = _present(store, announced)
+    announced, published = store.announced(), store.published()
+    # What was announced of a machine that is retired was deleted, but not that of the others of its
+    # folder, which have one list of refused logs with it. With damage it is not known of which.
+    folders = {one.refused for one in published if one.machine in announced}
+    known = folders if not store.damaged["announced"] else ()
+    present = [one for one in published if one.machine in announced or one.refused not in known]
     files = file_names([one.machine for one in present])
     rows, failed = dict[str, Summary](), dict[str, str]()
     progress("reporting", 0, len(present))
@@ -372,19 +363,6 @@ def report(
     )
 
 
-def _present(store: Store, announced: Container[str]) -> list[Published]:
-    """List the published assessments without those of machines that are retired.
-
-    The row of what was announced of such a machine was deleted; other machines of its folder, which
-    have one list of refused logs with it, have theirs.
-    """
-    published = store.published()
-    if store.damaged["announced"]:  # it is not known of which machines
-        return list(published)
-    folders = {one.refused for one in published if one.machine in announced}
-    return [one for one in published if one.machine in announced or one.refused not in folders]
-
-
 def _judging(settings: Settings = Settings()) -> Judging:
     """Return on which day pages and statuses are judged, by default today (UTC)."""
     today = settings.today or datetime.now(UTC).date()
@@ -399,18 +377,6 @@ def _prepare(out: Path) -> None:
         remove_abandoned(out)
     except OSError as error:
         raise LmshealthError(f"{out}: cannot be written to: {error.strerror}") from error
-
-
-def _others(folder: Path, logs: frozenset[str]) -> str:
-    """Return the suffixes of the files of a folder without logs."""
-    if logs:
-        return ""
-    files = (path for path in folder.rglob("*") if path.is_file() and path.name not in NOT_LOGS)
-    counts = Counter(path.suffix for path in files if path.name[0] != ".")
-    found = ", ".join(f"{n} {visible(suffix)}" for suffix, n in counts.most_common(3))
-    if not found:
-        return " (the folder has no files; name the one that has the logs)"
-    return f" (files: {found}; `lmshealth init FILE` tries one)"
 
 
 def _of_names(machines: Iterable[str], announced: Iterable[str]) -> Iterator[str]:
@@ -445,26 +411,31 @@ def _bare(name: str) -> str:
 def _none_usable(
     folder: Path, logs: frozenset[str], refused: Sequence[Refusal], lost: set[str]
 ) -> str:
-    """Return why no log is usable; first of a manifest that cannot be read, if there is one."""
+    """Return why no log is usable: a manifest that cannot be read, other files, the refusals.
+
+    Of these the most frequent reason, and the first log with its first detail.
+    """
     tables = (one for one in refused if PurePosixPath(one.log).name == MANIFEST)
     first = next((one for one in tables if one.reason not in (MISSPELT, "bad-row")), None)
     manifest = "" if first is None else f"{first.log}: {first.detail}; "
-    found = f"{len(logs)} found{_others(folder, logs)}"
-    why = f"{len(lost)} refused{_commonest(refused, lost)}"
-    return f"{folder}: no usable log: {manifest}{found}, {why}"
-
-
-def _commonest(refused: Iterable[Refusal], lost: Container[str]) -> str:
-    """Return the most frequent reason of refused logs, and the detail of the first of them."""
+    others = ""
+    if not logs:
+        files = (path for path in folder.rglob("*") if path.is_file() and path.name not in NOT_LOGS)
+        suffixes = Counter(path.suffix for path in files if path.name[0] != ".").most_common(3)
+        others = " (the folder has no files; name the one that has the logs)"
+        if suffixes:
+            found = ", ".join(f"{n} {visible(suffix)}" for suffix, n in suffixes)
+            others = f" (files: {found}; `lmshealth init FILE` tries one)"
     why: dict[str, dict[str, str]] = {}
-    for refusal in refused:
-        if refusal.log in lost:
-            why.setdefault(refusal.reason, {}).setdefault(refusal.log, refusal.detail)
-    if not why:
-        return ""
-    reason, details = max(why.items(), key=lambda item: len(item[1]))
-    log, detail = min(details.items())
-    return f": {len(details)} as {reason}, such as {log}: {detail}"
+    for one in refused:
+        if one.log in lost:
+            why.setdefault(one.reason, {}).setdefault(one.log, one.detail)
+    commonest = ""
+    if why:
+        reason, details = max(why.items(), key=lambda item: len(item[1]))
+        log, detail = min(details.items())
+        commonest = f": {len(details)} as {reason}, such as {log}: {detail}"
+    return f"{manifest}{len(logs)} found{others}, {len(lost)} refused{commonest}"
 
 
 def _report(
@@ -518,9 +489,8 @@ def _tables(
 
     def of_logs(machine: Machine) -> dict[str, bytes]:
         logs = unpack_logs(store.packed_logs(machine.logs))
-        rows = refused_rows([own for one in logs for own in one.modes.refused])
-        texts = {"refused": csv_text("refused", rows), **_tables_of_logs(logs)}
-        return {name: pack(text) for name, text in texts.items()}
+        refused = [own for one in logs for own in one.modes.refused]
+        return _packed({"refused": refused_rows(refused)}, logs)
 
     for machine in machines:
         if machine.name not in made:
@@ -629,13 +599,10 @@ def _files(folder: Path, out: Path) -> _Files:
     inside = out.resolve()
     for parent, folders, files in os.walk(folder.absolute()):
         here = Path(parent)
-        folders[:] = [
-            name for name in folders if name[0] != "." and (here / name).resolve() != inside
-        ]
+        visited = [name for name in folders if name[0] != "."]
+        folders[:] = [name for name in visited if (here / name).resolve() != inside]
         for path in (here / name for name in files if name[0] != "."):
-            try:
+            with suppress(OSError):  # removed meanwhile
                 seen = path.stat()
-            except OSError:  # removed meanwhile
-                continue
-            found[path] = seen.st_size, seen.st_mtime_ns
+                found[path] = seen.st_size, seen.st_mtime_ns
     return found

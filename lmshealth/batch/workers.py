@@ -116,9 +116,6 @@ class _ProcessPool(Pool):
                 return
             except futures.BrokenExecutor:
                 self.close(kill=True)
-            except BaseException:
-                self.close(kill=True)
-                raise
         found = f"worker processes end as they start ({constants.START_ATTEMPTS} attempts)"
         raise LmshealthError(f"{found}: is there enough memory? Use fewer --workers")
 

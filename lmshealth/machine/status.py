@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from datetime import date, datetime, timedelta
 from typing import Any, Literal
@@ -37,16 +37,18 @@ def notices(assessment: Assessment) -> tuple[Notice, ...]:
     return tuple(sorted(found, key=lambda one: _SEVERITIES.index(one.severity)))
 
 
-def _noticed(key: str, where: str = "", code: str = "", **values: object) -> Notice:
-    """Return a notice of `NOTICES`, whose key begins with its code unless that is another one."""
+def _noticed(key: str, *where: str, code: str = "", **values: object) -> Notice:
+    """Return a notice of `NOTICES`, whose key begins with its code unless that is another one.
+
+    Its sentence may have the modes, parameter, channel or log where it is as name or names.
+    """
     severity, what, to_do = NOTICES[key]
-    return Notice(code or key.split(",")[0], severity, where, what.format(**values), to_do)
-
-
-def _listed(modes: Iterable[str]) -> str:
-    """List names of modes: commas, and the last after "and"."""
-    *names, last = map(spell, modes)
-    return f"{', '.join(names)} and {last}" if names else last
+    *others, last = map(spell, where or ("",))
+    listed = f"{', '.join(others)} and {last}" if others else last
+    values = {"name": listed, "names": listed} | values
+    return Notice(
+        code or key.split(",")[0], severity, ", ".join(where), what.format(**values), to_do
+    )
 
 
 def _of_names(assessment: Assessment) -> Iterator[Notice]:
@@ -55,40 +57,38 @@ def _of_names(assessment: Assessment) -> Iterator[Notice]:
         yield Notice("names-in-doubt", "serious", "", assessment.doubt)
     latest = assessment.latest
     flags = () if latest is None else zip(latest.modes.names, latest.modes.flags, strict=True)
-    by_flag: dict[str, list[str]] = {}
+    by_flag: dict[str, dict[str, None]] = {}
     for mode, own in flags:
         for flag in (one for one in own.split() if one not in WARNINGS.values()):
-            by_flag.setdefault(flag, []).append(mode)
+            by_flag.setdefault(flag, {})[mode] = None
     for flag, modes in by_flag.items():
-        modes, meaning = list(dict.fromkeys(modes)), FLAGS.get(flag) or fact("see modes.csv.")
-        values = {"flag": flag, "names": _listed(modes), "meaning": meaning}
-        yield _noticed("flag", ", ".join(modes), flag, **values)
+        meaning = FLAGS.get(flag) or fact("see modes.csv.")
+        yield _noticed("flag", *modes, code=flag, flag=flag, meaning=meaning)
 
 
 def _of_track(assessment: Assessment) -> Iterator[Notice]:
     """Yield notices about drifts, jumps and the consistency of the filter."""
-    track = assessment.track
-    n_logs = len(assessment.history.logs) - assessment.history.baseline
+    track, first = assessment.track, assessment.history.baseline
+    n_logs = len(assessment.history.logs) - first
     for mode, (size, n_std) in assessment.drifted.items():
         moved = f"{100 * np.expm1(size):+.2f}".replace("-", "−")
         name = spell(mode).capitalize()
         yield _noticed("large-drift", mode, mode=name, size=moved, n=n_logs, n_std=n_std)
     left = {k: n for k, n in assessment.left_out.items() if k not in assessment.drifted}
     for n in sorted(set(left.values())):
-        modes = [mode for mode, own in left.items() if own == n]
         key = "last-logs-left-out, more" if n > 1 else "last-logs-left-out, one"
-        yield _noticed(key, ", ".join(modes), n=n, names=_listed(modes))
-    first = assessment.history.baseline
-    if track is not None and (modes := [mode for k, mode in track.outliers if k == first]):
+        yield _noticed(key, *(mode for mode, own in left.items() if own == n), n=n)
+    if track is None:
+        return
+    if modes := [mode for k, mode in track.outliers if k == first]:
         day = utc_day(track.recorded_at[first]).isoformat()
-        yield _noticed("baseline-left-out", ", ".join(modes), names=_listed(modes), day=day)
-    if track is not None and track.suspected is not None:
+        yield _noticed("baseline-left-out", *modes, day=day)
+    if track.suspected is not None:
         day = utc_day(track.recorded_at[track.suspected.first]).isoformat()
         yield _noticed("step-suspected", day=day)
-    if track is not None and not (found := track.consistency()).holds:
-        notice = _noticed(
-            "filter-inconsistent", p=f"{min(found.p_value, found.autocorrelation_p_value):.1g}"
-        )
+    if not (found := track.consistency()).holds:
+        p = f"{min(found.p_value, found.autocorrelation_p_value):.1g}"
+        notice = _noticed("filter-inconsistent", p=p)
         if (factor := track.widening[-1]) > 1:
             wide = fact("Its intervals are {factor:.1f} times as wide.", factor=factor)
             notice = replace(notice, what=f"{notice.what} {wide}")
@@ -106,7 +106,7 @@ def _of_health(assessment: Assessment) -> Iterator[Notice]:
         yield _noticed("above-baseline", name, name=spell(name).capitalize())
     for name, edge in zip(health.parameters, health.at_edge[-1], strict=True):
         if edge:
-            yield _noticed("end-of-map", name, name=spell(name))
+            yield _noticed("end-of-map", name)
 
 
 def _of_refused(assessment: Assessment) -> Iterator[Notice]:
@@ -118,7 +118,7 @@ def _of_refused(assessment: Assessment) -> Iterator[Notice]:
     for (reason, channel), rows in found.items():
         key, n = "channel" if WARNINGS[reason] else "channel, repaired", len({r.log for r in rows})
         own = {"channel": channel, "detail": rows[-1].detail, "log": rows[-1].log, "n": n}
-        yield _noticed(key, channel, reason, **own)
+        yield _noticed(key, channel, code=reason, **own)
     if lost := {row.log: row.reason for row in assessment.lost}:
         n, total = len(lost), len(lost) + len(assessment.history.logs)
         key = "logs-refused, many" if are_many(n, total) else "logs-refused"
@@ -132,7 +132,7 @@ def _of_laws(assessment: Assessment) -> Iterator[Notice]:
     if prognosis is None:
         return
     for name in prognosis.unidentifiable:
-        yield _noticed("limit-not-included", name, name=spell(name))
+        yield _noticed("limit-not-included", name)
     for lone in prognosis.modes_off:
         if lone.probability >= LONE_NAMED:
             what = lone_sentence(lone, assessment.stage)
@@ -318,10 +318,8 @@ def make_status(assessment: Assessment, summary: Summary) -> Status:
     alarms = undeclared_events(track, assessment.history.baseline, "alarm")
     shown = [one for one in summary.health if one.determined]
     # A limit that later work has restored is reached no more.
-    limited = (
-        one for one in shown if one.limit is not None and one.name not in assessment.restored
-    )
-    reached = [one.below_limit for one in limited]
+    limited = (one for one in shown if one.limit is not None)
+    reached = [one.below_limit for one in limited if one.name not in assessment.restored]
     reached += [life.any.already_past] if life else []
     health = [
         {
@@ -330,17 +328,14 @@ def make_status(assessment: Assessment, summary: Summary) -> Status:
         }
         for one in shown
     ]
-    after = _silent_after(assessment.history.recorded_at)
     made = Status(
         stage=summary.identity,
         page=summary.file,
         description=assessment.stage.name,
         recorded_at=summary.recorded_at,
         baseline_at=summary.baseline_at,
-        silent_after_days=after,
-        own_silent_after_days=after or 0.0,
+        own_silent_after_days=_silent_after(assessment.history.recorded_at),
         verdict=summary.verdict,
-        verdict_at_last_log=summary.verdict,
         probability=finite_or_none(summary.probability),
         why=summary.why,
         alarms={one.mode: track.recorded_at[one.epoch] for one in alarms} if track else {},
@@ -356,21 +351,28 @@ def make_status(assessment: Assessment, summary: Summary) -> Status:
         service_by=service.by,
         inspect_by=service.inspect_by,
     )
-    return _judged(made, assessment.today or utc_day(summary.recorded_at))
+    return judge_on(made, assessment.today or utc_day(summary.recorded_at), None)
 
 
-def _silent_after(moments: Sequence[datetime]) -> float | None:
+def _silent_after(moments: Sequence[datetime]) -> float:
     """Return the days without a log after which a machine is silent, by its own intervals.
 
-    None with logs of a single day. Several logs of one day are a single one here.
+    0 with logs of a single day. Several logs of one day are a single one here.
     """
     n = constants.SILENT_INTERVALS
     days = sorted({utc_day(one) for one in moments})[-n - 1 :]
-    return n * (days[-1] - days[0]).days / (len(days) - 1) if len(days) > 1 else None
+    return n * (days[-1] - days[0]).days / (len(days) - 1) if len(days) > 1 else 0.0
 
 
-def _judged(status: Status, today: date) -> Status:
-    """Set on a day the conditions of a status, its state by NE 107 and its verdict."""
+def judge_on(status: Status, today: date, silent_days: float | None) -> Status:
+    """Judge a status on a day: conditions, state by NE 107 and verdict.
+
+    Without ``silent_days`` a silence begins by the intervals of the machine's own logs.
+    """
+    own = status.own_silent_after_days
+    after = silent_days or (status.silent_after_days if own is None else own or None)
+    # A status of an earlier schema is written again in this one.
+    status = msgspec.structs.replace(status, schema=constants.JSON_SCHEMA, silent_after_days=after)
     found, verdict = conditions(status, today), _at_last_log(status)
     state: DeviceHealth = next(iter(found.values()), "NORMAL")
     unknown = "silent" in found and verdict in ("healthy", "no-alarm")
@@ -387,32 +389,20 @@ def _judged(status: Status, today: date) -> Status:
     )
 
 
-def judge_on(status: Status, today: date, silent_days: float | None) -> Status:
-    """Judge a status on a day.
-
-    Without ``silent_days`` a silence begins by the intervals of the machine's own logs.
-    """
-    own = status.own_silent_after_days
-    after = silent_days or (status.silent_after_days if own is None else own or None)
-    # A status of an earlier schema is written again in this one.
-    status = msgspec.structs.replace(status, schema=constants.JSON_SCHEMA, silent_after_days=after)
-    return _judged(status, today)
-
-
 def on_day(summary: Summary, status: Status, today: date) -> Summary:
     """Return a summary as of a day, by the status on that day: state, urgency, step, days left."""
-    service, found = summary.service, summary
+    service = summary.service
     late = "late" if {"silent", "inspection-overdue"} & status.conditions.keys() else ""
     is_past = service.kind == "by" and service.by is not None and service.by < today
     if status.unknown_since:
         urgency = min(summary.urgency, (1, 0.0, 0.0, summary.identity))
-        found = replace(summary, state="open", urgency=urgency, unknown=True)
+        summary = replace(summary, state="open", urgency=urgency, unknown=True)
     postponed = [row for row in summary.postponed if row[0] >= today][: constants.POSTPONED_SHOWN]
     # Logs as rare as the step allows would let the machine become silent.
     often = min(summary.step.log_every, status.silent_after_days or np.inf)
     kind = step_of(*summary.step.case, "overdue" if is_past else late)
     step = replace(summary.step, kind=kind, log_every=often)
-    return replace(found, today=today, step=step, postponed=tuple(postponed))
+    return replace(summary, today=today, step=step, postponed=tuple(postponed))
 
 
 def compare(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import date, datetime
 from typing import Literal
 
@@ -96,19 +96,11 @@ def next_step(assessment: Assessment, service: Service) -> NextStep:
     needed = {*lost, *(first if kind in ("now", "by") else ()), *(left if kind == "now" else ())}
     done = any(notice.code == "no-log-since" for notice in assessment.notices)
     case = "worked" if done and not parts.keys() & needed else _class_of(assessment), kind, age
-    step = step_of(*case)
+    step = NextStep(step_of(*case), tuple(parts.items()), case=case)
     if prognosis is None:
-        return NextStep(step, tuple(parts.items()), case=case)
-    every = days_to(prognosis, service.inspect_every)
-    return NextStep(
-        kind=step,
-        parts=tuple(parts.items()),
-        by=service.by,
-        log_every=every,
-        horizon=prognosis.horizon,
-        partial=bool(prognosis.unidentifiable),
-        case=case,
-    )
+        return step
+    every, partial = days_to(prognosis, service.inspect_every), bool(prognosis.unidentifiable)
+    return replace(step, by=service.by, log_every=every, horizon=prognosis.horizon, partial=partial)
 
 
 def _ending_first(prognosis: Prognosis | None) -> list[str]:
@@ -164,11 +156,13 @@ def first_limit(prognosis: Prognosis | None) -> tuple[str, float] | None:
     return prognosis.parameters[k], float(shares[k])
 
 
-State = Literal["good", "bad", "open"]
-_KM = 1000.0
-
-
 # Summaries
+
+State = Literal["good", "bad", "open"]
+Postponed = tuple[tuple[date, int | None, tuple[float, float]], ...]
+"""Days of a postponed service, weeks late (or None), and bounds of the risk."""
+
+_KM = 1000.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -261,8 +255,7 @@ class Summary:
     step: NextStep
     # Modes, or ``all``, in which the last log is left out: the verdict is that before it.
     deviates: tuple[str, ...] = ()
-    # Days of a postponed service, weeks late (or None), and bounds of the risk.
-    postponed: tuple[tuple[date, int | None, tuple[float, float]], ...] = ()
+    postponed: Postponed = ()
     # Day that it is of; `status.on_day` sets it, and what depends on it.
     today: date | None = None
     unknown: bool = False  # whether its last log is too old for the verdict that it allows
@@ -273,9 +266,11 @@ def summarise(assessment: Assessment, service: Service, file: str = "") -> Summa
 
     Limits that later work has restored are left out, unless these are all.
     """
-    judgement, left = assessment.judgement, assessment.limits_left
-    prognosis = left or assessment.prognosis
-    history, of_fleet = assessment.history, assessment.calibration
+    judgement, history, life = assessment.judgement, assessment.history, None
+    prognosis = assessment.limits_left or assessment.prognosis
+    if prognosis is not None:
+        of_fleet, whole = assessment.calibration, assessment.prognosis
+        life = summarise_life(prognosis, assessment.stage, of_fleet, whole)
     healthy: State = "open" if assessment.left_out else "good"  # until a jump is confirmed or not
     states: dict[str, State] = {"healthy": healthy, OUTSIDE_MAP: "open"}
     states |= dict.fromkeys(NO_HEALTH, "open")
@@ -304,24 +299,21 @@ def summarise(assessment: Assessment, service: Service, file: str = "") -> Summa
         probability=judgement.probability,
         why=judgement.why,
         health=tuple(_parameters(assessment)),
-        life=summarise_life(prognosis, assessment.stage, of_fleet, assessment.prognosis)
-        if prognosis
-        else None,
+        life=life,
         service=service,
         step=step,
         deviates=deviates if judgement.probability >= 0 else (),
-        postponed=tuple(_postponed(prognosis, service)),
+        postponed=_postponed(prognosis, service),
     )
 
 
-def _postponed(
-    prognosis: Prognosis | None, service: Service
-) -> Iterator[tuple[date, int | None, tuple[float, float]]]:
-    """Yield the days and risks of a postponed service as `Summary` has them."""
-    for weeks in constants.POSTPONED_WEEKS if prognosis and service.by else ():
-        assert prognosis is not None
-        if (day := day_after(prognosis, max(service.wait, 0.0) + 7 * weeks)) is not None:
-            yield day, weeks or None, risk_before(prognosis, day)
+def _postponed(prognosis: Prognosis | None, service: Service) -> Postponed:
+    """Return the days and risks of a postponed service."""
+    if prognosis is None or service.by is None:
+        return ()
+    wait = max(service.wait, 0.0)
+    days = ((weeks, day_after(prognosis, wait + 7 * weeks)) for weeks in constants.POSTPONED_WEEKS)
+    return tuple((day, weeks or None, risk_before(prognosis, day)) for weeks, day in days if day)
 
 
 def summarise_life(
@@ -334,22 +326,20 @@ def summarise_life(
     baselines = {spec.name: spec.baseline for spec in stage.parameters}
     past, beyond = prognosis.already_past(), prognosis.beyond_horizon()
     travel, days = np.maximum(prognosis.censored(), 0), np.maximum(remaining_days(prognosis), 0)
-    limits = []
-    for k, name in enumerate(prognosis.parameters):
-        baseline = baselines.get(name, 1.0)
-        wait = quantiles(days[:, k])
-        limits.append(
-            LimitLife(
-                parameter=name,
-                limit=float(prognosis.limits[k]),
-                travel=quantiles(travel[:, k]),
-                days=wait,
-                dates=tuple(day_after(prognosis, one) for one in wait),
-                already_past=float(past[k]),
-                beyond_horizon=float(beyond[k]),
-                baseline=baseline,
-            )
+    waits = [quantiles(own) for own in days.T]
+    limits = [
+        LimitLife(
+            parameter=name,
+            limit=float(prognosis.limits[k]),
+            baseline=baselines.get(name, 1.0),
+            travel=quantiles(travel[:, k]),
+            days=waits[k],
+            dates=tuple(day_after(prognosis, one) for one in waits[k]),
+            already_past=float(past[k]),
+            beyond_horizon=float(beyond[k]),
         )
+        for k, name in enumerate(prognosis.parameters)
+    ]
     return Life(
         stage=prognosis.stage,
         recorded_at=prognosis.recorded_at,
@@ -379,16 +369,15 @@ def _parameters(assessment: Assessment) -> Iterator[ParameterHealth]:
     health = assessment.latest_health
     if health is None:
         return
+    n = len(health.travel)
+    rows = np.unique(np.linspace(0, n - 1, constants.COURSE_POINTS).round().astype(int))
+    # Without an odometer the epochs are at equal distances.
+    at = health.travel if np.isfinite(health.travel).all() else np.arange(n)
     for k, spec in enumerate(assessment.stage.parameters):
         limit, draws = limit_of(spec), health.samples[-1, :, k]
-        below = np.nan if limit is None else float(np.mean(draws < limit))
         low, median, high = np.quantile(draws, constants.LEVELS).tolist()
         determined = bool(health.publishable_parameters()[k])
-        rows = np.linspace(0, len(health.travel) - 1, constants.COURSE_POINTS).round().astype(int)
-        rows = np.unique(rows)
         bands = np.quantile(health.samples[rows, :, k], constants.LEVELS, axis=1)
-        # Without an odometer the epochs are at equal distances.
-        at = health.travel if np.isfinite(health.travel).all() else np.arange(len(health.travel))
         course = np.stack([at[rows], *bands], axis=1).round(4)
         yield ParameterHealth(
             name=spec.name,
@@ -398,7 +387,7 @@ def _parameters(assessment: Assessment) -> Iterator[ParameterHealth]:
             median=median,
             high=high,
             limit=limit,
-            below_limit=below,
+            below_limit=np.nan if limit is None else float(np.mean(draws < limit)),
             baseline=spec.baseline,
             unit=spec.unit,
             course=tuple(map(tuple, course.tolist())) if determined else (),
