@@ -106,8 +106,7 @@ def label(text: str) -> str:
         return text if chosen == "en" else known
     for own, translation in _patterns(chosen, "", ""):
         if found := own.fullmatch(text):
-            values = _values(chosen, found)
-            return translation.format(**values)
+            return translation.format(**_values(chosen, found))
     return _value(chosen, text)
 
 
@@ -121,37 +120,27 @@ def _catalogue(chosen: Language) -> gettext.NullTranslations:
 
 
 @cache
-def _templates(chosen: Language) -> list[tuple[str, str, str]]:
-    """Return context, message and translation of all messages without a plural."""
+def _patterns(chosen: Language, context: str, end: str) -> list[tuple[re.Pattern[str], str]]:
+    """Return the templates of a context with their translations, most text of their own first."""
     # gettext lists its messages nowhere else; those with a plural are pairs, the header is empty.
     known = vars(_catalogue(chosen))["_catalog"]
     parts = [(own.rpartition("\4"), text) for own, text in known.items() if isinstance(own, str)]
-    return [(context, message, text) for (context, _, message), text in parts if message]
-
-
-@cache
-def _patterns(chosen: Language, wanted: str, end: str) -> list[tuple[re.Pattern[str], str]]:
-    """Return the templates of a context with their translations, most text of their own first."""
     found = [
-        (template, own)
-        for context, template, own in _templates(chosen)
-        if context == wanted and (context or "{" in template)
+        (template, text)
+        for (own, _, template), text in parts
+        if own == context and template and (context or "{" in template)
     ]
     found.sort(key=lambda one: len(re.sub(r"{[^}]*}", "", one[0])), reverse=True)
-    return [(re.compile(_pattern(template) + end), own) for template, own in found]
+    return [(re.compile(_pattern(template) + end), text) for template, text in found]
 
 
 def _pattern(template: str) -> str:
     """Return the pattern of a template; a value that it has twice is the same in both places."""
-    seen = set[str]()
-
-    def place(found: re.Match[str]) -> str:
-        name = found[1]
-        again = name in seen
-        seen.add(name)
-        return f"(?P={name})" if again else f"(?P<{name}>.+?)"
-
-    return _PLACE.sub(place, re.escape(template))
+    parts = _PLACE.split(re.escape(template))  # every second one is a name
+    names = parts[1::2]
+    for k, name in enumerate(names):
+        parts[2 * k + 1] = f"(?P={name})" if name in names[:k] else f"(?P<{name}>.+?)"
+    return "".join(parts)
 
 
 @lru_cache(maxsize=1000)
