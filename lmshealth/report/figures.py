@@ -65,8 +65,7 @@ _STYLE: dict[str, Any] = {
 _DASHED: Any = (0, (5, 3))  # of baselines
 _KM = 1000.0
 _DPI = 200  # of images in a figure: enough for zooming and printing
-_LEVELS = np.array(constants.BAND_LEVELS)
-_MEDIAN = _LEVELS.size // 2
+_LEVELS = np.array(constants.BAND_LEVELS)  # the third is the median
 # Of a baseline: up to it health is drawn; a median beyond it is no share of a baseline.
 _MOST_SHARE = 2.5
 _GRID_POINTS = 72
@@ -447,7 +446,7 @@ def draw(result: Result, what: str = "", ax: Axes | None = None) -> Axes:
                 return plot_health(axes, _expect_fraction(result, what), what, None)
             case Prognosis() if what not in ("", "any"):
                 # Laws begin at the baseline of their parameter.
-                begin = result.curve_quantiles[_MEDIAN, 0, names.index(what)]
+                begin = result.curve_quantiles[2, 0, names.index(what)]
                 return plot_life(axes, result, what, baseline=float(begin))
             case Prognosis():
                 return plot_survival(axes, result)

@@ -90,20 +90,20 @@ def sentence(text: str) -> str:
 
     Results keep their sentences as text, which tables, stores and saved files have in English.
     """
-    known = None if language() == "en" or not text else _sentences(language(), text)
-    return text if known is None else known[1]
+    known = _sentences(language(), text)
+    return known[1] if known else text
 
 
 def is_known(text: str) -> bool:
     """Return whether `sentence` translates a text into the present language."""
-    return language() == "en" or not text or _sentences(language(), text) is not None
+    return _sentences(language(), text) is not None
 
 
 def label(text: str) -> str:
     """Translate a label of a figure that was drawn in English, with its numbers and names."""
     chosen = language()
-    if chosen == "en" or (known := tr(text)) != text:
-        return text if chosen == "en" else known
+    if (known := tr(text)) != text or chosen == "en":
+        return known
     for own, translation in _patterns(chosen, "", ""):
         if found := own.fullmatch(text):
             return translation.format(**_values(chosen, found))
@@ -150,6 +150,8 @@ def _sentences(chosen: Language, text: str) -> tuple[int, str] | None:
     Of several ways to divide it the one is taken in which the templates have most text of their
     own; how much, in characters, is returned with the translation.
     """
+    if chosen == "en" or not text:
+        return 0, text
     if len(text) > _MOST_TEXT:
         return None
     ways = []
@@ -158,8 +160,7 @@ def _sentences(chosen: Language, text: str) -> tuple[int, str] | None:
         for found in filter(None, (own.match(text), own.fullmatch(text))):
             if (between := _BETWEEN.match(text, found.end())) is None:
                 continue
-            rest = text[between.end() :]
-            if (further := _sentences(chosen, rest) if rest else (0, "")) is not None:
+            if (further := _sentences(chosen, text[between.end() :])) is not None:
                 n = found.end() - sum(map(len, found.groups())) + further[0]
                 ways.append((n, found, translation, f"{between[1] or ''} ", between[2], further[1]))
     if not ways:
