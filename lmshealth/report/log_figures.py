@@ -81,12 +81,10 @@ def modes_figure(
     below = shapes_size(shapes, stage)[1]
 
     def draw(figure: Figure) -> None:
-        if not below:
-            plot_spectra(figure, summary, modes, stage, sought=reading.sought)
-            return
-        parts: Any = figure.subfigures(2, height_ratios=[height, below])
+        parts: Any = figure.subfigures(2, height_ratios=[height, below]) if below else [figure]
         plot_spectra(parts[0], summary, modes, stage, sought=reading.sought)
-        plot_shapes(parts[1], shapes, stage)
+        if below:
+            plot_shapes(parts[1], shapes, stage)
 
     return LogFigure(tr("Modes of {log}", log=log.name), (width, height + below), draw, modes)
 

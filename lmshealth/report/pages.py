@@ -59,8 +59,7 @@ def make_page(assessment: Assessment, summary: Summary, *, before: Summary | Non
     before : Summary, optional
         Summary of the machine in its previous report.
     """
-    prognosis = assessment.limits_left or assessment.prognosis
-    health, fleet = assessment.latest_health, assessment.fleet
+    prognosis, fleet = assessment.limits_left or assessment.prognosis, assessment.fleet
     highest = max((one.high for one in summary.health), default=1.0)
     priors = (scatter_prior(assessment.stage), fleet.scatter) if fleet else ()
     content = _track_content(assessment) | {
@@ -69,14 +68,10 @@ def make_page(assessment: Assessment, summary: Summary, *, before: Summary | Non
         "summary": summary,
         "bar": float(np.clip(np.ceil(10 * highest + 0.5) / 10, 1.2, 2.0)),
         "first_limit": first_limit(prognosis),
-        "restored": text.joined(map(spell, sorted(assessment.restored))),
         "prognosis": prognosis,
         "before": before,
         "mark": _MARK,
-        "news": before and [*text.changes(before, summary)],
-        "health": health,
-        "pairs": [] if health is None else list(_pairs(health)),
-        "fleet": fleet,
+        "pairs": list(_pairs(assessment.latest_health)),
         # Expected random walk, factor and deviation, each by the description and by the fleet.
         "scatter": list(zip(*map(expected_scatter, priors), strict=True)),
         "pace": _pace,
@@ -102,19 +97,10 @@ def date_page(page: str, summary: Summary, status: Status) -> str:
     of the same day.
     """
     assert summary.today is not None  # of a summary of a day
-    parts = render(
-        "day.html.j2",
-        mark=_MARK,
-        summary=summary,
-        status=status,
-        states=coming_states(status, summary.today),
-        headline=text.headline(summary),
-        verdict=text.verdict_text(summary),
-        to_do=text.next_step(summary.step),
-        due=text.service_on_day(summary),
-    ).split(_MARK)
+    states = coming_states(status, summary.today)
+    parts = render("day.html.j2", mark=_MARK, summary=summary, status=status, states=states)
     pieces = page.split(_MARK)[1:]  # the page begins with a mark
-    return "".join(part + piece for part, piece in zip(parts, pieces, strict=True))
+    return "".join(part + piece for part, piece in zip(parts.split(_MARK), pieces, strict=True))
 
 
 def latest_modes(track: Track, stage: Stage, mac: Mapping[str, float]) -> list[dict[str, Any]]:
@@ -268,7 +254,7 @@ def _plots(
 ) -> Iterator[tuple[tuple[str, ...], Any]]:
     """Yield what draws each picture of the machine's life, after its key on the page."""
     history, track, waterfall = assessment.history, assessment.track, assessment.waterfall
-    health, prognosis = content["health"], content["prognosis"]
+    health, prognosis = assessment.latest_health, content["prognosis"]
     specs = {spec.name: spec for spec in assessment.stage.parameters}
     lives: dict[str, Any] = {"history": history, "track": track}
     for mode in content["seen"]:
@@ -308,12 +294,13 @@ def _log_pictures(assessment: Assessment) -> Iterator[tuple[str, Any, tuple[floa
         yield "shapes", partial(plot, before=before and before.shapes), size
 
 
-def _pairs(health: Health) -> Iterator[tuple[tuple[str, ...], str, float]]:
+def _pairs(health: Health | None) -> Iterator[tuple[tuple[str, ...], str, float]]:
     """Yield parameters to draw against each other, the title and their correlation."""
-    names = health.parameters
+    names = health.parameters if health else ()
     if len(names) == 1:
         yield names, spell(names[0]), 0.0
     for i, j in combinations(range(len(names)), 2):
+        assert health is not None
         title = tr("{one} against {other}", one=spell(names[i]), other=spell(names[j]))
         yield (names[i], names[j]), title, float(health.correlation[-1, i, j])
 
@@ -388,10 +375,6 @@ def write_index(
     content = render(
         "index.html.j2",
         rows=ranked,
-        headline=text.headline,
-        verdict_text=text.verdict_text,
-        due=text.service_on_day,
-        silent=sum(one.unknown for one in ranked),
         today=today,
         parameters=list(dict.fromkeys(own.name for one in ranked for own in one.health)),
         states=Counter(one.state for one in ranked),
@@ -401,7 +384,6 @@ def write_index(
         newest=newest,
         refused=by_reason,
         gone=[(one, (folder / one.page).exists()) for one in gone],
-        fold=len(refused) > constants.REFUSED_UNFOLDED,
         script=script,
     )
     path = folder / "index.html"

@@ -19,7 +19,7 @@ from lmshealth.report.language import decimal, mark, mark_either, sentence, tr, 
 
 if TYPE_CHECKING:  # above, so that --help needs no scipy
     from lmshealth.machine.service import Service
-    from lmshealth.machine.summary import NextStep, Summary
+    from lmshealth.machine.summary import Life, NextStep, Summary
 
 
 _KM = 1000.0
@@ -429,24 +429,7 @@ def changes(before: Summary, now: Summary) -> Iterator[str]:
         yield tr("Verdict: still {now}, before {probability}.", now=present, probability=earlier)
     yield from _health_changes(before, now)
     if before.life is not None or now.life is not None:
-        low, middle, high = (
-            [
-                travel_left(life.any.travel[k], life.horizon) if life else tr("not known")
-                for life in (before.life, now.life)
-            ]
-            for k in (0, 3, 6)  # quantiles of 5, 50 and 95 %
-        )
-        spread = f" (90{GAP}%: {ends(low[1], high[1])})" if now.life and low[1] != high[1] else ""
-        of_limits = [
-            {one.parameter for one in x.life.limits} if x.life else None for x in (before, now)
-        ]
-        if None in of_limits or of_limits[0] == of_limits[1]:
-            yield tr("Remaining life, median: {change}.", change=f"{_from_to(*middle)}{spread}")
-        else:
-            yield tr(
-                "Remaining life, median: {life}; before, it was until other limits.",
-                life=f"{middle[1]}{spread}",
-            )
+        yield _life_change(before.life, now.life)
     if before.service.by is not None or now.service.by is not None:
         yield _service_change(before.service, now.service)
     more, travel = now.n_logs - before.n_logs, now.travel - before.travel
@@ -475,6 +458,22 @@ def _health_changes(before: Summary, now: Summary) -> Iterator[str]:
         own = present.get(name)
         spread = f" (90{GAP}%: {interval(own.low, own.high)})" if own else ""
         yield f"{capitalize(spell(name))}: {' → '.join(medians)}{spread}."
+
+
+def _life_change(before: Life | None, now: Life | None) -> str:
+    low, middle, high = (
+        [
+            travel_left(life.any.travel[k], life.horizon) if life else tr("not known")
+            for life in (before, now)
+        ]
+        for k in (0, 3, 6)  # quantiles of 5, 50 and 95 %
+    )
+    spread = f" (90{GAP}%: {ends(low[1], high[1])})" if now and low[1] != high[1] else ""
+    limits = [{one.parameter for one in life.limits} for life in (before, now) if life]
+    if len(limits) == 2 and limits[0] != limits[1]:
+        words = tr("Remaining life, median: {life}; before, it was until other limits.")
+        return words.format(life=f"{middle[1]}{spread}")
+    return tr("Remaining life, median: {change}.", change=f"{_from_to(*middle)}{spread}")
 
 
 def _service_change(before: Service, now: Service) -> str:
