@@ -199,13 +199,12 @@ def plot_posterior(ax: Axes, health: Health, parameters: tuple[str, ...]) -> Axe
     columns = [health.parameters.index(name) for name in parameters]
     draws = 100 * health.samples[-1][:, columns]
     draws = draws[np.isfinite(draws).all(axis=1)]
-    first, *second = (tr("{name} in % of baseline", name=_spell(name)) for name in parameters)
-    if second:
-        _regions(ax, draws)
-        ax.set_ylabel(second[0])
-    else:
+    if len(columns) == 1:
         _density(ax, draws[:, 0])
-    ax.set_xlabel(first)
+    else:
+        _regions(ax, draws)
+        ax.set_ylabel(tr("{name} in % of baseline", name=_spell(parameters[1])))
+    ax.set_xlabel(tr("{name} in % of baseline", name=_spell(parameters[0])))
     return legend(ax)
 
 
