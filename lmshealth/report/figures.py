@@ -29,7 +29,7 @@ from lmshealth.machine.summary import quantiles
 from lmshealth.modal.modes import Modes
 from lmshealth.modal.spectra_summary import Waterfall
 from lmshealth.report import constants, text
-from lmshealth.report.language import decimal, language, mark, tr
+from lmshealth.report.language import decimal, mark, tr
 from lmshealth.report.text import GAP, spell
 from lmshealth.tracking.history import History
 from lmshealth.tracking.track import CovariateEffect, Track
@@ -65,8 +65,7 @@ _STYLE: dict[str, Any] = {
 _DASHED: Any = (0, (5, 3))  # of baselines
 _KM = 1000.0
 _DPI = 200  # of images in a figure: enough for zooming and printing
-_LEVELS = np.array(constants.BAND_LEVELS)
-_MEDIAN = _LEVELS.size // 2
+_LEVELS = np.array(constants.BAND_LEVELS)  # the third is the median
 # Of a baseline: up to it health is drawn; a median beyond it is no share of a baseline.
 _MOST_SHARE = 2.5
 _GRID_POINTS = 72
@@ -133,6 +132,8 @@ def print_figure(
 
     target = io.BytesIO()
     style: Any = _STYLE | {"svg.hashsalt": salt}
+    canvas_of: dict[str, Any] = {"svg": FigureCanvasSVG, "png": FigureCanvasAgg}
+    left_out = {"svg": ("Date", "Creator", "Format", "Type"), "png": ("Software",)}
     with matplotlib.rc_context(), warnings.catch_warnings():
         # Settings of the process, or of its user, are not those of a page.
         matplotlib.rcdefaults()
@@ -143,17 +144,11 @@ def print_figure(
         draw(figure)
         _write_decimals(figure)
         # Directly, because `savefig` draws everything twice.
-        canvas: Any
-        if kind == "svg":
-            canvas = FigureCanvasSVG(figure)
-            figure.dpi = 72  # at which `print_svg` places texts
-            _fix_layout(figure)
-            figure.dpi = _DPI
-            canvas.print_svg(target, metadata=dict.fromkeys(("Date", "Creator", "Format", "Type")))
-        else:
-            canvas = FigureCanvasAgg(figure)
-            _fix_layout(figure)
-            canvas.print_png(target, metadata={"Software": None})
+        canvas = canvas_of[kind](figure)
+        figure.dpi = 72 if kind == "svg" else _DPI  # at which `print_svg` places texts
+        _fix_layout(figure)
+        figure.dpi = _DPI
+        getattr(canvas, f"print_{kind}")(target, metadata=dict.fromkeys(left_out[kind]))
     return target.getvalue()
 
 
@@ -161,9 +156,7 @@ def _write_decimals(figure: Figure) -> None:
     """Write the numbers at the axes with the decimal mark of the language."""
     for axis in (own for ax in figure.axes for own in (ax.xaxis, ax.yaxis)):
         formatter: Any = axis.get_major_formatter()
-        if language() != "en" and hasattr(formatter, "fix_minus"):
-            fix = formatter.fix_minus
-            formatter.fix_minus = lambda text, fix=fix: decimal(fix(text))
+        formatter.fix_minus = lambda text, fix=formatter.fix_minus: decimal(fix(text))
 
 
 def _fix_layout(figure: Figure) -> None:
@@ -231,11 +224,11 @@ def plot_health(ax: Axes, health: Health, parameter: str, limit: float | None) -
         hints(ax, health.travel / _KM, bands[2], texts)
     _levels(ax, limit)
     # Show bands up to a share, baseline and limit.
-    values = [100.0, float(np.nanmin(bands[0])), float(np.nanmax(bands[4]))]
-    values += [] if limit is None else [100 * limit]
+    level = 100.0 if limit is None else 100 * limit
+    values = 100.0, level, float(np.nanmin(bands[0])), float(np.nanmax(bands[4]))
     low, high = min(values), min(max(values), 100 * _MOST_SHARE)
-    ax.set_ylim(max(low - 0.06 * (high - low), 0.0), high + 0.06 * (high - low))
-    ax.set_ylabel(tr("% of baseline"))
+    margin = 0.06 * (high - low)
+    ax.set(ylim=(max(low - margin, 0.0), high + margin), ylabel=tr("% of baseline"))
     return odometer(ax)
 
 
@@ -262,9 +255,9 @@ def plot_life(ax: Axes, prognosis: Prognosis, parameter: str, *, baseline: float
         right = end
         ax.axvline(end, color=MUTED, lw=1.2, ls="-.", label=tr("horizon"))
     left = min(float(travel.min()), now)
+    top = max(108.0, 1.04 * float(np.max(bands[4][travel <= right], initial=0.0)))
     ax.set_xlim(left - 0.01 * (right - left), right + 0.02 * (right - left))
-    ax.set_ylim(0, max(108.0, 1.04 * float(np.max(bands[4][travel <= right], initial=0.0))))
-    ax.set_ylabel(tr("% of baseline"))
+    ax.set(ylim=(0, top), ylabel=tr("% of baseline"))
     odometer(ax)
     if not shown:
         label = tr("travel in km (horizon at {distance}, not shown)")
@@ -307,16 +300,14 @@ def plot_survival(ax: Axes, prognosis: Prognosis, *, service: Service | None = N
     ]
     hints(ax, some, chance, texts)
     if service is not None and service.kept_risk is not None:
-        risk, label = decimal(f"{100 * service.kept_risk:.3g}"), tr("accepted risk {risk} %")
+        label = tr("accepted risk {risk} %")
         label = tr("risk at least cost {risk} %") if service.cost_ratio else label
-        label = label.format(risk=risk)
+        label = label.format(risk=decimal(f"{100 * service.kept_risk:.3g}"))
         ax.axhline(100 * (1 - service.kept_risk), color=RED, lw=1.2, ls=(0, (5, 2)), label=label)
-    ax.set_xlim(0, end)
-    ax.set_ylim(0, 103)
     grouped(ax)
     whole = tr("travel from now in km (ends at the horizon)")
-    ax.set_xlabel(whole if end == horizon else tr("travel from now in km"))
-    ax.set_ylabel(tr("probability in %"))
+    label = whole if end == horizon else tr("travel from now in km")
+    ax.set(xlim=(0, end), ylim=(0, 103), xlabel=label, ylabel=tr("probability in %"))
     return legend(ax)
 
 
@@ -351,11 +342,10 @@ def _passage(ax: Axes, now: float, ahead: FloatArray, level: float) -> None:
     names = tr("Early (5 %)"), tr("Median"), tr("Late (95 %)")
     for x, far, name in zip(where, ahead, names, strict=True):
         if np.isfinite(x):
-            left, at = text.km(_KM * far), text.whole_km(_KM * x)
-            hint = tr("{name}: in {ahead}, at {odometer}", name=name, ahead=left, odometer=at)
-            if far <= 0:
-                hint = f"{name}: {tr('already passed')}"
-            hints(ax, np.array([x]), np.array([level]), [hint])
+            own = {"name": name, "ahead": text.km(_KM * far), "odometer": text.whole_km(_KM * x)}
+            hint = tr("{name}: in {ahead}, at {odometer}", **own)
+            passed = f"{name}: {tr('already passed')}"
+            hints(ax, np.array([x]), np.array([level]), [hint if far > 0 else passed])
 
 
 def _regions(ax: Axes, draws: FloatArray) -> None:
@@ -389,8 +379,7 @@ def _regions(ax: Axes, draws: FloatArray) -> None:
     span = np.quantile(draws, [0.002, 0.998], axis=0)
     first, last = np.minimum(span[0], 100.0), np.maximum(span[1], 100.0)
     first, last = first - 0.16 * (last - first), last + 0.06 * (last - first)
-    ax.set_xlim(first[0], last[0])
-    ax.set_ylim(first[1], last[1])
+    ax.set(xlim=(first[0], last[0]), ylim=(first[1], last[1]))
     across, up = ax.get_xaxis_transform(), ax.get_yaxis_transform()
     ax.plot([low[0], high[0]], [0.05] * 2, "|-", color=INK, lw=1.4, ms=8, transform=across)
     name = tr("marginal 90 %")
@@ -408,9 +397,8 @@ def plot_log(ax: Axes, log: Log, channel: str) -> Axes:
             segment = min(_SEGMENT, stop - start)
             f, density = welch(one.values[start:stop], log.sample_rate, nperseg=segment)
             ax.plot(f[1:], density[1:], lw=0.8, label=plain_label(one.name))
-    ax.set_yscale("log")
-    ax.set_xlabel(tr("frequency in Hz"))
-    ax.set_ylabel(tr("PSD in ({unit})²/Hz", unit=SI_UNITS[kind]))
+    ylabel = tr("PSD in ({unit})²/Hz", unit=SI_UNITS[kind])
+    ax.set(yscale="log", xlabel=tr("frequency in Hz"), ylabel=ylabel)
     return legend(ax)
 
 
@@ -421,9 +409,8 @@ def plot_modes(ax: Axes, modes: Modes) -> Axes:
     ax.errorbar(f, damping, color=BLUE, ms=4, **style)
     for name, x, y in zip(modes.names, f, damping, strict=True):
         ax.annotate(_spell(name), (x, y), xytext=(4, 4), textcoords="offset points")
-    ax.set_ylim(bottom=0)
-    ax.set_xlabel(tr("natural frequency in Hz"))
-    ax.set_ylabel(tr("damping ratio in %"))
+    labels = {"xlabel": tr("natural frequency in Hz"), "ylabel": tr("damping ratio in %")}
+    ax.set(ylim=(0, None), **labels)
     return ax
 
 
@@ -458,7 +445,7 @@ def draw(result: Result, what: str = "", ax: Axes | None = None) -> Axes:
                 return plot_health(axes, _expect_fraction(result, what), what, None)
             case Prognosis() if what not in ("", "any"):
                 # Laws begin at the baseline of their parameter.
-                begin = result.curve_quantiles[_MEDIAN, 0, names.index(what)]
+                begin = result.curve_quantiles[2, 0, names.index(what)]
                 return plot_life(axes, result, what, baseline=float(begin))
             case Prognosis():
                 return plot_survival(axes, result)
@@ -470,8 +457,7 @@ def _parts(result: Any) -> list[str]:
     if isinstance(result, Log):
         return [one.name for one in result.channels]
     kinds = "parameters", "modes", "names"
-    found = next((getattr(result, n) for n in kinds if hasattr(result, n)), ())
-    return list(found)
+    return list(next((getattr(result, kind) for kind in kinds if hasattr(result, kind)), ()))
 
 
 def _expect_fraction(health: Health, parameter: str) -> Health:
@@ -502,8 +488,7 @@ def _density(ax: Axes, draws: FloatArray) -> None:
     ax.plot(x, density, color=BLUE, lw=1.6)
     ax.axvline(float(q[2]), color=INK, lw=1.4, label=tr("median"))
     ax.axvline(100, color=GREEN, lw=1.3, ls=_DASHED, label=tr("baseline"))
-    ax.set_ylim(0, 1.06 * density.max())
-    ax.set_ylabel(tr("probability density per %"))
+    ax.set(ylim=(0, 1.06 * density.max()), ylabel=tr("probability density per %"))
 
 
 def along(lives: History | Track) -> FloatArray:
@@ -520,12 +505,10 @@ def odometer(ax: Axes, lives: History | Track | None = None, *, room: int = ROOM
     Without ``lives`` it is that of the travel of a life, which may be counted by the time.
     """
     grouped(ax)
-    if lives is None:
-        label = tr("travel in km")
-    elif np.isfinite(lives.travel).all():
-        label = tr("odometer in km")
-    else:
-        label = tr("days since the first log")
+    label = tr("travel in km")
+    if lives is not None:
+        is_known = np.isfinite(lives.travel).all()
+        label = tr("odometer in km") if is_known else tr("days since the first log")
     ax.set_xlabel(label)
     return legend(ax, room=room)
 
@@ -597,8 +580,7 @@ def plot_frequencies(ax: Axes, history: History, track: Track | None, mode: str)
 
 def plot_track(ax: Axes, track: Track, mode: str) -> Axes:
     """Plot the filtered natural frequency of a mode with its 95 % band, and the steps."""
-    k = track.modes.index(mode)
-    x = along(track)
+    k, x = track.modes.index(mode), along(track)
     _filtered(ax, x, track.ln_frequency[:, k], track.ln_frequency_std[:, k], 1.0)
     names = {kind: tr(words) for kind, words in _WORDS.items()}  # each in the legend once
     own = (step for step in track.steps if step.mode in ("", mode))
@@ -641,11 +623,9 @@ def plot_nis(ax: Axes, track: Track) -> Axes:
     if not inside.all():
         ax.plot(x[~inside], nis[~inside], "D", color=RED, ms=5, label=tr("outside"))
     if nis.size and nis.max() > 4 * high.max():
-        ax.set_yscale("log")
-        ax.set_ylabel(tr("NIS (log scale)"))
+        ax.set(yscale="log", ylabel=tr("NIS (log scale)"))
     else:
-        ax.set_ylim(bottom=0)
-        ax.set_ylabel("NIS")
+        ax.set(ylim=(0, None), ylabel="NIS")
     return odometer(ax, track)
 
 
@@ -684,9 +664,8 @@ def plot_waterfall(
     ax.set_ylim(waterfall.edges[0], waterfall.edges[-1])
     if waterfall.edges[-1] > _WIDE * waterfall.edges[0]:
         ax.set_yscale("log")
-    if track is not None:
-        for k in range(len(track.modes)):
-            _on_image(ax, track, k, 0.0 if moved is None else moved[:, k])
+    for k in range(len(track.modes) if track else 0):
+        _on_image(ax, track, k, 0.0 if moved is None else moved[:, k])
     ax.set_ylabel(tr("frequency in Hz"))
     return odometer(ax, history, room=36)  # next to the colour bar
 
@@ -712,8 +691,8 @@ def plot_influence(ax: Axes, influence: CovariateEffect, history: History) -> Ax
     texts, words = [], tr("as measured {before}, corrected {after}")
     for k, value, *both in zip(epochs, x, before, after, strict=True):
         measured, corrected = (f"{text.signed(one, 2)}{GAP}%" for one in both)
-        own = words.format(before=measured, after=corrected)
         there = f"{name} {decimal(f'{value:.4g}')}{GAP}{unit}"
+        own = words.format(before=measured, after=corrected)
         texts.append(f"{title(history, k)}\n{there}\n{own}")
     hints(ax, x, before, texts)
     ax.set_xlabel(plain_label(tr("{name} in {unit}", name=name, unit=unit) if unit else name))

@@ -90,24 +90,23 @@ def sentence(text: str) -> str:
 
     Results keep their sentences as text, which tables, stores and saved files have in English.
     """
-    known = None if language() == "en" or not text else _sentences(language(), text)
-    return text if known is None else known[1]
+    known = _sentences(language(), text)
+    return known[1] if known else text
 
 
 def is_known(text: str) -> bool:
     """Return whether `sentence` translates a text into the present language."""
-    return language() == "en" or not text or _sentences(language(), text) is not None
+    return _sentences(language(), text) is not None
 
 
 def label(text: str) -> str:
     """Translate a label of a figure that was drawn in English, with its numbers and names."""
     chosen = language()
-    if chosen == "en" or (known := tr(text)) != text:
-        return text if chosen == "en" else known
+    if (known := tr(text)) != text or chosen == "en":
+        return known
     for own, translation in _patterns(chosen, "", ""):
         if found := own.fullmatch(text):
-            values = _values(chosen, found)
-            return translation.format(**values)
+            return translation.format(**_values(chosen, found))
     return _value(chosen, text)
 
 
@@ -121,37 +120,27 @@ def _catalogue(chosen: Language) -> gettext.NullTranslations:
 
 
 @cache
-def _templates(chosen: Language) -> list[tuple[str, str, str]]:
-    """Return context, message and translation of all messages without a plural."""
+def _patterns(chosen: Language, context: str, end: str) -> list[tuple[re.Pattern[str], str]]:
+    """Return the templates of a context with their translations, most text of their own first."""
     # gettext lists its messages nowhere else; those with a plural are pairs, the header is empty.
     known = vars(_catalogue(chosen))["_catalog"]
     parts = [(own.rpartition("\4"), text) for own, text in known.items() if isinstance(own, str)]
-    return [(context, message, text) for (context, _, message), text in parts if message]
-
-
-@cache
-def _patterns(chosen: Language, wanted: str, end: str) -> list[tuple[re.Pattern[str], str]]:
-    """Return the templates of a context with their translations, most text of their own first."""
     found = [
-        (template, own)
-        for context, template, own in _templates(chosen)
-        if context == wanted and (context or "{" in template)
+        (template, text)
+        for (own, _, template), text in parts
+        if own == context and template and (context or "{" in template)
     ]
     found.sort(key=lambda one: len(re.sub(r"{[^}]*}", "", one[0])), reverse=True)
-    return [(re.compile(_pattern(template) + end), own) for template, own in found]
+    return [(re.compile(_pattern(template) + end), text) for template, text in found]
 
 
 def _pattern(template: str) -> str:
     """Return the pattern of a template; a value that it has twice is the same in both places."""
-    seen = set[str]()
-
-    def place(found: re.Match[str]) -> str:
-        name = found[1]
-        again = name in seen
-        seen.add(name)
-        return f"(?P={name})" if again else f"(?P<{name}>.+?)"
-
-    return _PLACE.sub(place, re.escape(template))
+    parts = _PLACE.split(re.escape(template))  # every second one is a name
+    names = parts[1::2]
+    for k, name in enumerate(names):
+        parts[2 * k + 1] = f"(?P={name})" if name in names[:k] else f"(?P<{name}>.+?)"
+    return "".join(parts)
 
 
 @lru_cache(maxsize=1000)
@@ -161,6 +150,8 @@ def _sentences(chosen: Language, text: str) -> tuple[int, str] | None:
     Of several ways to divide it the one is taken in which the templates have most text of their
     own; how much, in characters, is returned with the translation.
     """
+    if chosen == "en" or not text:
+        return 0, text
     if len(text) > _MOST_TEXT:
         return None
     ways = []
@@ -169,8 +160,7 @@ def _sentences(chosen: Language, text: str) -> tuple[int, str] | None:
         for found in filter(None, (own.match(text), own.fullmatch(text))):
             if (between := _BETWEEN.match(text, found.end())) is None:
                 continue
-            rest = text[between.end() :]
-            if (further := _sentences(chosen, rest) if rest else (0, "")) is not None:
+            if (further := _sentences(chosen, text[between.end() :])) is not None:
                 n = found.end() - sum(map(len, found.groups())) + further[0]
                 ways.append((n, found, translation, f"{between[1] or ''} ", between[2], further[1]))
     if not ways:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import textwrap
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from itertools import cycle
+from itertools import cycle, product
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -20,6 +20,7 @@ from lmshealth.modal.mode_shapes import ModeShapes, mode_shapes
 from lmshealth.modal.modes import Modes
 from lmshealth.modal.spectra_summary import WIDE, SpectraSummary, density, summarise
 from lmshealth.report import figures, tables
+from lmshealth.report.figures import BLUE, GREEN, GRID, INK, MUTED, RED, plain_label
 from lmshealth.report.language import decimal, tr
 from lmshealth.report.rendering import render
 from lmshealth.report.text import spell
@@ -80,12 +81,10 @@ def modes_figure(
     below = shapes_size(shapes, stage)[1]
 
     def draw(figure: Figure) -> None:
-        if not below:
-            plot_spectra(figure, summary, modes, stage, sought=reading.sought)
-            return
-        parts: Any = figure.subfigures(2, height_ratios=[height, below])
+        parts: Any = figure.subfigures(2, height_ratios=[height, below]) if below else [figure]
         plot_spectra(parts[0], summary, modes, stage, sought=reading.sought)
-        plot_shapes(parts[1], shapes, stage)
+        if below:
+            plot_shapes(parts[1], shapes, stage)
 
     return LogFigure(tr("Modes of {log}", log=log.name), (width, height + below), draw, modes)
 
@@ -137,7 +136,7 @@ def plot_shapes(
         own = {"MPC": float(shapes.complexity[i]), "MAC": float(mac[i])}
         values = (f"{name} {decimal(f'{one:.2f}')}" for name, one in own.items() if one == one)
         title = f"{spell(shapes.names[i])}\n{', '.join(values)}"
-        axes[0].set_title(figures.plain_label(title), size=9)
+        axes[0].set_title(plain_label(title), size=9)
         axes[-1].tick_params(labelleft=column == 0)
     handles, labels = grid[len(heights) - 1, 0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower left", ncols=4)
@@ -166,14 +165,14 @@ def _plot_components(ax: Axes, shapes: ModeShapes, i: int, before: ModeShapes | 
         own = np.array([row[k].real if k >= 0 else np.nan for k in at])
         # Shapes are known but for their sign.
         own = own * (np.sign(np.nansum(own * part.real)) or 1.0)
-        ax.barh(y, own, color=figures.MUTED, alpha=0.35, label=tr("at the baseline, real"), **style)
+        ax.barh(y, own, color=MUTED, alpha=0.35, label=tr("at the baseline, real"), **style)
     style["height"] = 0.26
-    ax.barh(y, part.real, color=figures.BLUE, label=tr("in phase (real)"), **style)
-    ax.plot(part.imag, y, "D", color=figures.RED, ms=3.5, label=tr("90° shifted (imaginary)"))
-    ax.axvline(0, color=figures.MUTED, lw=0.8)
+    ax.barh(y, part.real, color=BLUE, label=tr("in phase (real)"), **style)
+    ax.plot(part.imag, y, "D", color=RED, ms=3.5, label=tr("90° shifted (imaginary)"))
+    ax.axvline(0, color=MUTED, lw=0.8)
     ax.set_xlim(-1.1, 1.1)
     ax.set_xticks([-1, 0, 1])
-    ax.set_yticks(y, [figures.plain_label(name) for name in shapes.channels])
+    ax.set_yticks(y, [plain_label(name) for name in shapes.channels])
     ax.invert_yaxis()
 
 
@@ -192,24 +191,24 @@ def plot_shape(ax: Axes, shapes: ModeShapes, i: int, places: Sequence[ChannelSpe
     start, end = rest @ _ISOMETRIC, moved @ _ISOMETRIC
     ground = np.c_[rest[:, :2], np.full(len(rest), rest[:, 2].min())] @ _ISOMETRIC
     for foot, point in zip(ground, start, strict=True):
-        ax.plot(*np.c_[foot, point], color=figures.GRID, lw=0.8)
+        ax.plot(*np.c_[foot, point], color=GRID, lw=0.8)
     from scipy.sparse.csgraph import minimum_spanning_tree  # late, as matplotlib
 
     # Neighbours are joined: the shortest tree.
     apart = np.linalg.norm(rest[:, None] - rest, axis=2)
     for a, b in zip(*minimum_spanning_tree(apart).nonzero(), strict=True):
-        ax.plot(*start[[a, b]].T, color=figures.MUTED, lw=0.8, ls=":")
-        ax.plot(*end[[a, b]].T, color=figures.BLUE, lw=1)
-    ax.plot(*start.T, "o", mfc="none", mec=figures.MUTED, ms=5)
-    style: Any = {"arrowstyle": "-|>", "color": figures.BLUE, "shrinkA": 0, "shrinkB": 0}
+        ax.plot(*start[[a, b]].T, color=MUTED, lw=0.8, ls=":")
+        ax.plot(*end[[a, b]].T, color=BLUE, lw=1)
+    ax.plot(*start.T, "o", mfc="none", mec=MUTED, ms=5)
+    style: Any = {"arrowstyle": "-|>", "color": BLUE, "shrinkA": 0, "shrinkB": 0}
     for point, tip in zip(start, end, strict=True):
         ax.annotate("", tip, point, arrowprops=style)
     # Axes of the positions, in the lower left corner.
     corner = np.vstack([ground, start, end]).min(axis=0) - 0.25 * extent
     for axis, name in zip(0.2 * extent * _ISOMETRIC, "xyz", strict=True):
-        ax.plot(*np.c_[corner, corner + axis], color=figures.MUTED, lw=0.8)
+        ax.plot(*np.c_[corner, corner + axis], color=MUTED, lw=0.8)
         u, v = corner + 1.3 * axis
-        ax.text(u, v, name, color=figures.MUTED, size=8, ha="center", va="center")
+        ax.text(u, v, name, color=MUTED, size=8, ha="center", va="center")
     ax.update_datalim(end)
     ax.margins(0.12)
     ax.set_aspect("equal", anchor="N")
@@ -249,21 +248,19 @@ def plot_spectra(
     ):
         if before is not None and before.spectra is not None:
             _plot_before(ax, before.spectra, before.modes, name)
-        ax.plot(middle, own, color=figures.INK, lw=0.7, label=tr("measured"))
-        ax.plot(middle, fit, color=figures.GREEN, lw=1.4, label=tr("fit"))
+        ax.plot(middle, own, color=INK, lw=0.7, label=tr("measured"))
+        ax.plot(middle, fit, color=GREEN, lw=1.4, label=tr("fit"))
         if np.isfinite(fit).any():
-            style: Any = {"color": figures.GREEN, "alpha": 0.2, "lw": 0}
-            ax.fill_between(
-                middle, *(fit * range_), **style, label=tr("95 % range of the data, by the fit")
-            )
-        label = figures.plain_label(name) + ("\n" + tr("(2nd derivative)") if derived else "")
+            words = tr("95 % range of the data, by the fit")
+            ax.fill_between(middle, *(fit * range_), color=GREEN, alpha=0.2, lw=0, label=words)
+        label = plain_label(name) + ("\n" + tr("(2nd derivative)") if derived else "")
         label += f"\n({tr(refused[name])})" if name in refused else ""
         _name_panel(ax, label)
         _mark_lines(ax, modes, name, middle, own)
     for k, values in enumerate(singular):
-        style = {"lw": 0.9 if k == 0 else 0.6, "color": figures.MUTED if k else figures.INK}
         shown = np.where(values > _RANK * singular[0], values, np.nan)
-        panels[len(level)].plot(middle, shown, **style)
+        width, colour = (0.6, MUTED) if k else (0.9, INK)
+        panels[len(level)].plot(middle, shown, lw=width, color=colour)
     if singular.size:
         _name_panel(panels[len(level)], tr("singular values\nof all channels"))
     for ax in panels[: len(level) + bool(singular.size)]:
@@ -284,12 +281,11 @@ def _plot_before(ax: Axes, summary: SpectraSummary, modes: Modes, channel: str) 
     if channel not in summary.channels:
         return
     own = density(summary.level[summary.channels.index(channel)])
-    low = np.nanmin(own, initial=np.inf)
-    style: Any = {"color": figures.MUTED, "alpha": 0.3, "lw": 0}
-    ax.fill_between(summary.centres, low, own, label=tr("measured at the baseline"), **style)
+    low, label = np.nanmin(own, initial=np.inf), tr("measured at the baseline")
+    ax.fill_between(summary.centres, low, own, color=MUTED, alpha=0.3, lw=0, label=label)
     for f in modes.frequency.tolist():
         if summary.low <= f <= summary.high:
-            ax.axvline(f, color=figures.MUTED, lw=1, ls="-.", label=tr("mode at the baseline"))
+            ax.axvline(f, color=MUTED, lw=1, ls="-.", label=tr("mode at the baseline"))
 
 
 def _name_panel(ax: Axes, name: str) -> None:
@@ -303,21 +299,20 @@ def _plot_search(panels: Sequence[Axes], sought: Found) -> None:
         own = poles.stable == stable
         label = tr("stable pole of the search") if stable else tr("other pole of the search")
         place = poles.frequency[own], poles.order[own]
-        ax.plot(*place, "o", ms=2.5, color=figures.INK, label=label, **style)
-    for line in sought.harmonics:
-        for panel in panels:
-            span: Any = {"color": figures.RED, "alpha": 0.15, "lw": 0}
-            panel.axvspan(line.low, line.high, **span, label=tr("band of a line that wanders"))
+        ax.plot(*place, "o", ms=2.5, color=INK, label=label, **style)
+    words = tr("band of a line that wanders")
+    for line, panel in product(sought.harmonics, panels):
+        panel.axvspan(line.low, line.high, color=RED, alpha=0.15, lw=0, label=words)
 
 
 def _join(listed: Sequence[Refusal], rejected: Sequence[Refusal]) -> tuple[Refusal, ...]:
     """Append resonances that are not listed, ascending; name those without one by frequency."""
-    found = [one for one in rejected if one not in listed and one.reason != "not-excited"]
+    new = [one for one in rejected if one not in listed and one.reason != "not-excited"]
+    found = [replace(one, mode="") for one in new if one.frequency]
     found.sort(key=lambda one: one.frequency or 0.0)
-    named = [replace(one, mode="") for one in found if one.frequency]
     return tuple(
         replace(one, mode=f"{one.frequency:.4g} Hz") if one.frequency and not one.mode else one
-        for one in (*listed, *named)
+        for one in (*listed, *found)
     )
 
 
@@ -334,23 +329,20 @@ def response_figure(
 
     def draw(figure: Figure) -> None:
         panels = list(figure.subplots(3, sharex=True, height_ratios=[2, 1.2, 0.8]))
-        points: Any = {"color": figures.MUTED, "ms": 2.5, "lw": 0}
-        fitted: Any = {"color": figures.GREEN, "lw": 1.4, "label": tr("fit")}
+        points: Any = {"color": MUTED, "ms": 2.5, "lw": 0}
+        fitted: Any = {"color": GREEN, "lw": 1.4, "label": tr("fit")}
         x, gain = fit.ordinates.frequency, np.abs(frf.response)
         panels[0].plot(frf.frequency, gain, "o", label=tr("measured"), **points)
         panels[0].plot(x, np.abs(fit.response), **fitted)
-        panels[0].set_yscale("log")
-        panels[0].set_ylabel(tr("gain in {unit}", unit=unit))
+        panels[0].set(yscale="log", ylabel=tr("gain in {unit}", unit=unit))
         _mark_lines(panels[0], modes, frf.output, frf.frequency, gain)
         panels[1].plot(frf.frequency, np.angle(frf.response, deg=True), "o", **points)
         phase = np.angle(fit.response, deg=True)
         phase[1:][np.abs(np.diff(phase)) > 180] = np.nan  # no line from -180 to 180
         panels[1].plot(x, phase, **fitted)
-        panels[1].set_ylabel(tr("phase in °"))
-        panels[1].set_yticks([-180, -90, 0, 90, 180])
-        panels[2].plot(frf.frequency, frf.coherence, color=figures.INK, lw=0.9)
-        panels[2].set_ylabel(tr("coherence"))
-        panels[2].set_ylim(0, 1.05)
+        panels[1].set(ylabel=tr("phase in °"), yticks=[-180, -90, 0, 90, 180])
+        panels[2].plot(frf.frequency, frf.coherence, color=INK, lw=0.9)
+        panels[2].set(ylabel=tr("coherence"), ylim=(0, 1.05))
         low, high = frf.frequency[[0, -1]].tolist()
         _annotate(figure, panels, (low, high), modes, stage)
 
@@ -374,7 +366,7 @@ def write_figure(path: Path, figure: LogFigure) -> None:
     def draw(whole: Figure) -> None:
         parts: Any = whole.subfigures(2, height_ratios=[height, below or 1e-3])
         upper, lower = parts
-        upper.suptitle(figures.plain_label(figure.title), x=0.01, ha="left", size=10)
+        upper.suptitle(plain_label(figure.title), x=0.01, ha="left", size=10)
         figure.draw(upper)
         lower.text(0.01, 1, "\n".join(notes), va="top", size=7.5, linespacing=1.3)
 
@@ -410,18 +402,18 @@ def _mark_lines(
         y = 1.5 * np.interp(x, frequency, level)
         unknown = tr("line of unknown origin")
         name = unknown if kind == "unknown" else tr("line: {kind}", kind=spell(kind))
-        label = figures.plain_label(name)
-        ax.plot(x, y, marker, color=figures.RED, ms=4, mew=0, label=label)
+        label = plain_label(name)
+        ax.plot(x, y, marker, color=RED, ms=4, mew=0, label=label)
 
 
 def _mark_orders(panels: Sequence[Axes], summary: SpectraSummary, stage: Stage | None) -> None:
     """Mark where the described orders of the velocities of the log are, whether found or not."""
     band = summary.low, summary.high
-    for f, name in expected_orders(stage, summary.velocities, band) if stage else ():
-        style: Any = {"color": figures.RED, "ms": 9, "mew": 1.4}
-        label = figures.plain_label(tr("expected: {name}", name=spell(name)))
-        for ax in panels:
-            ax.plot(f, 0.05, "|", transform=ax.get_xaxis_transform(), label=label, **style)
+    orders = expected_orders(stage, summary.velocities, band) if stage else ()
+    for (f, name), ax in product(orders, panels):
+        label = plain_label(tr("expected: {name}", name=spell(name)))
+        place = ax.get_xaxis_transform()
+        ax.plot(f, 0.05, "|", color=RED, ms=9, mew=1.4, transform=place, label=label)
 
 
 def _annotate(
@@ -432,40 +424,37 @@ def _annotate(
     stage: Stage | None,
 ) -> None:
     """Draw modes and refused candidates in all panels, their names, the legend and the notes."""
-    labels = []
+    labels, last = [], panels[-1]
     for k, f in enumerate(modes.frequency.tolist()):
         reach = 1.96 * float(np.sqrt(modes.cov[k, k]))
+        low, high = f * np.exp(-reach), f * np.exp(reach)
         for ax in panels:
-            span: Any = {"color": figures.BLUE, "alpha": 0.35, "lw": 0}
-            label = tr("mode, 95 % interval")
-            ax.axvspan(f * np.exp(-reach), f * np.exp(reach), label=label, **span)
-            ax.axvline(f, color=figures.BLUE, lw=0.6)
+            ax.axvspan(low, high, color=BLUE, alpha=0.35, lw=0, label=tr("mode, 95 % interval"))
+            ax.axvline(f, color=BLUE, lw=0.6)
         name = spell(modes.names[k] or tr("unnamed"))
-        labels.append((f, f"{name}\n{_value(f, float(modes.frequency_std[k]))}", figures.BLUE))
+        labels.append((f, f"{name}\n{_value(f, float(modes.frequency_std[k]))}", BLUE))
     sought = {mode.name: mode.frequency_hz for mode in stage.modes} if stage else {}
-    place = panels[-1].get_xaxis_transform()
+    style: Any = {"color": GREEN, "ms": 6, "mew": 0, "clip_on": False}
     for declared in sought.values():
-        style: Any = {"color": figures.GREEN, "ms": 6, "mew": 0, "clip_on": False}
         if band[0] <= declared <= band[1]:
-            label = tr("declared frequency")
-            panels[-1].plot(declared, 0, "^", transform=place, label=label, **style)
+            place, label = last.get_xaxis_transform(), tr("declared frequency")
+            last.plot(declared, 0, "^", transform=place, label=label, **style)
+    style = {"color": RED, "lw": 1, "ls": (0, (4, 3))}
     for refusal in modes.refused:
         refused = refusal.frequency or sought.get(refusal.mode)
         if refused is not None and band[0] <= refused <= band[1]:
-            style = {"color": figures.RED, "lw": 1, "ls": (0, (4, 3))}
             for ax in panels:
-                ax.axvline(refused, **style, label=tr("refused, or not found"))
-            labels.append((refused, f"{spell(refusal.mode)}\n{tr(refusal.reason)}", figures.RED))
-    panels[-1].set_xlabel(tr("frequency in Hz"))
-    panels[-1].set_xlim(*band)
+                ax.axvline(refused, label=tr("refused, or not found"), **style)
+            labels.append((refused, f"{spell(refusal.mode)}\n{tr(refusal.reason)}", RED))
+    last.set(xlabel=tr("frequency in Hz"), xlim=band)
     if band[1] > WIDE * band[0] > 0:
-        from matplotlib.ticker import LogLocator, NullLocator, StrMethodFormatter
+        from matplotlib.ticker import LogLocator
 
-        panels[-1].set_xscale("log")
         subs = (1, 2, 5) if band[1] > 30 * band[0] else (1, 1.5, 2, 3, 4, 5, 7)
-        panels[-1].xaxis.set_major_locator(LogLocator(subs=subs))
-        panels[-1].xaxis.set_minor_locator(NullLocator())
-        panels[-1].xaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
+        last.set_xscale("log")
+        last.xaxis.set_major_locator(LogLocator(subs=subs))
+        last.xaxis.set_major_formatter("{x:g}")
+        last.xaxis.minorticks_off()
     _write_labels(panels[0], [label for label in labels if band[0] <= label[0] <= band[1]])
     entries: dict[str, Any] = {}
     for ax in panels:
@@ -482,12 +471,11 @@ def _value(frequency: float, std: float) -> str:
 
 def _write_labels(ax: Axes, labels: list[tuple[float, str, str]]) -> None:
     """Write names above the axes, moved apart as little as needed."""
-    labels = sorted(labels)
-    upright = len(labels) >= _UPRIGHT
-    apart = _APART_UPRIGHT if upright else _APART
     if not labels:
         return
-    steps = apart * np.arange(len(labels))
+    labels = sorted(labels)
+    upright = len(labels) >= _UPRIGHT
+    steps = (_APART_UPRIGHT if upright else _APART) * np.arange(len(labels))
     bottom = ax.get_ylim()[0]
     points = ax.transData.transform([(f, bottom) for f, _, _ in labels])
     places = ax.transAxes.inverted().transform(points)[:, 0]
@@ -497,7 +485,7 @@ def _write_labels(ax: Axes, labels: list[tuple[float, str, str]]) -> None:
     style: Any = {"rotation": 90 if upright else 0, "ha": "center", "va": "bottom", "size": 9}
     across, ends = ax.get_xaxis_transform(), ("axes fraction", "offset points")
     for (f, text, colour), x in zip(labels, moved.tolist(), strict=True):
-        text = figures.plain_label(text.replace("\n", "  ") if upright else text)
+        text = plain_label(text.replace("\n", "  ") if upright else text)
         arrow = {"arrowstyle": "-", "color": colour, "lw": 0.7, "shrinkA": 0, "shrinkB": 0}
         ax.annotate(text, (f, 1), (x, 16), across, ends, color=colour, arrowprops=arrow, **style)
 
@@ -508,6 +496,6 @@ def _notes(modes: Modes) -> list[str]:
     for refusal in modes.refused:
         what, why = spell(refusal.mode) or refusal.channel or tr("modes"), tr(refusal.reason)
         own = {"what": what, "reason": why, "detail": refusal.detail}
-        text = figures.plain_label(tr("{what} refused, {reason}: {detail}", **own))
+        text = plain_label(tr("{what} refused, {reason}: {detail}", **own))
         lines += textwrap.wrap(text, _NOTE_COLUMNS, subsequent_indent="    ")
     return lines

@@ -8,7 +8,7 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from datetime import date, timedelta
 from functools import partial
-from itertools import combinations
+from itertools import chain, combinations
 from operator import attrgetter
 from pathlib import Path
 from typing import Any, TypeVar
@@ -19,10 +19,9 @@ from scipy.special import chdtrc
 from lmshealth._private.files import free_name, write_text
 from lmshealth.io.log import Refusal, utc_day
 from lmshealth.life.constants import LONE_NAMED, MIN_FIT
-from lmshealth.life.fleet_prior import FleetPrior, LawPrior, Pace
+from lmshealth.life.fleet_prior import LawPrior, Pace
 from lmshealth.life.health import Health
 from lmshealth.life.posterior.likelihood import expected_scatter, scatter_prior
-from lmshealth.life.prognosis import Prognosis
 from lmshealth.life.verdict import OUTSIDE_MAP
 from lmshealth.machine.assessment import Assessment
 from lmshealth.machine.constants import LEVELS, RUL_LEVELS
@@ -38,7 +37,6 @@ from lmshealth.report.text import GAP, spell
 from lmshealth.stage.description import Stage
 from lmshealth.tracking.history import History
 from lmshealth.tracking.track import (
-    CovariateEffect,
     Effect,
     Track,
     covariate_shifts,
@@ -61,41 +59,30 @@ def make_page(assessment: Assessment, summary: Summary, *, before: Summary | Non
     before : Summary, optional
         Summary of the machine in its previous report.
     """
-    prognosis = assessment.limits_left or assessment.prognosis
-    health, fleet = assessment.latest_health, assessment.fleet
+    prognosis, fleet = assessment.limits_left or assessment.prognosis, assessment.fleet
     highest = max((one.high for one in summary.health), default=1.0)
-    content = _track_content(assessment)
-    content |= {
+    priors = (scatter_prior(assessment.stage), fleet.scatter) if fleet else ()
+    content = _track_content(assessment) | {
         "assessment": assessment,
         "notices": notices(assessment),
         "summary": summary,
         "bar": float(np.clip(np.ceil(10 * highest + 0.5) / 10, 1.2, 2.0)),
         "first_limit": first_limit(prognosis),
-        "restored": text.joined(map(spell, sorted(assessment.restored))),
         "prognosis": prognosis,
         "before": before,
         "mark": _MARK,
-        "outside": list(_outside_map(assessment, content["mac"])),
-        "news": before and [*text.changes(before, summary)],
-        "health": health,
-        "pairs": [] if health is None else list(_pairs(health)),
-        "fleet": fleet,
-        "scatter": list(_scatter(fleet, assessment.stage)),
+        "pairs": list(_pairs(assessment.latest_health)),
+        # Expected random walk, factor and deviation, each by the description and by the fleet.
+        "scatter": list(zip(*map(expected_scatter, priors), strict=True)),
         "pace": _pace,
         "fit": prognosis and chi_square_side(prognosis.chi_square, prognosis.degrees_of_freedom),
     }
     pictures: dict[tuple[str, ...], str] = {}
-
-    def add(plot: Callable[..., object], *key: str, **given: Any) -> None:
-        """Draw a picture of the page under its key."""
+    for key, draw in _plots(assessment, summary.service, content):
         size = _SIZES.get(key[0], figures.SIZE)
-        draw = partial(plot, **given)
         pictures[key] = figures.svg(draw, salt=f"p{len(pictures)}", size=size)
-
-    _draw_history(assessment, content, add)
-    _draw_life(assessment, prognosis, content["pairs"], summary.service, add)
-    for key, (whole, size) in _log_pictures(assessment).items():
-        pictures[key, "all"] = figures.inline(whole, salt=key, size=size)
+    for name, whole, size in _log_pictures(assessment):
+        pictures[name, "all"] = figures.inline(whole, salt=name, size=size)
     # An HTML parser needs no namespaces; without them the page names no address at all.
     content["picture"] = {
         key: re.sub(r'\sxmlns(:xlink)?="[^"]*"', "", svg) for key, svg in pictures.items()
@@ -110,19 +97,10 @@ def date_page(page: str, summary: Summary, status: Status) -> str:
     of the same day.
     """
     assert summary.today is not None  # of a summary of a day
-    parts = render(
-        "day.html.j2",
-        mark=_MARK,
-        summary=summary,
-        status=status,
-        states=coming_states(status, summary.today),
-        headline=text.headline(summary),
-        verdict=text.verdict_text(summary),
-        to_do=text.next_step(summary.step),
-        due=text.service_on_day(summary),
-    ).split(_MARK)
+    states = coming_states(status, summary.today)
+    parts = render("day.html.j2", mark=_MARK, summary=summary, status=status, states=states)
     pieces = page.split(_MARK)[1:]  # the page begins with a mark
-    return "".join(part + piece for part, piece in zip(parts, pieces, strict=True))
+    return "".join(part + piece for part, piece in zip(parts.split(_MARK), pieces, strict=True))
 
 
 def latest_modes(track: Track, stage: Stage, mac: Mapping[str, float]) -> list[dict[str, Any]]:
@@ -173,29 +151,23 @@ def _track_content(assessment: Assessment) -> dict[str, Any]:
     """Collect what the page shows of modes, events, covariates and data quality."""
     track, history, stage = assessment.track, assessment.history, assessment.stage
     refused = (*assessment.lost, *assessment.refused)
-    influences: tuple[CovariateEffect, ...] = ()
-    content: dict[str, Any] = dict.fromkeys(("consistency", "nis", "noise_scale", "widening"))
-    mac = _mac(assessment)
-    content |= {"modes": [], "events": [], "effects": [], "largest_drift": 0.0, "mac": mac}
+    content: dict[str, Any] = {"mac": (mac := _mac(assessment)), "largest_drift": 0.0}
+    content |= {"modes": [], "events": [], "effects": [], "corrected": {}, "nis": None}
     if track is not None:
-        influences = find_covariate_effects(history, track, stage)
+        corrected = (e for e in find_covariate_effects(history, track, stage) if e.values.size)
         content |= {
             "modes": latest_modes(track, stage, mac),
             "events": _grouped(track.events, attrgetter("kind", "epoch", "source")).values(),
             "effects": [effect for effect in track.effects if _is_shown(effect)],
-            "consistency": track.consistency(),
+            "corrected": _grouped(corrected, attrgetter("covariate")),
             "nis": _nis(track),
-            "noise_scale": float(track.noise_scale[-1].max()),
-            "widening": float(track.widening[-1]),
             "largest_drift": float(np.nanmax(np.abs(np.expm1(track.drift[-1])), initial=0.0)),
         }
-    corrected = [one for one in influences if one.values.size]
     found = np.isfinite(history.ln_frequency)
     return content | {
         "seen": [mode for mode in history.modes if found[:, history.columns(mode)].any()],
-        "influences": influences,
-        "corrected": _grouped(corrected, attrgetter("covariate")),
         "uncorrected": list(_uncorrected(history, stage)),
+        "outside": list(_outside_map(assessment, mac)),
         "mode_use": list(_mode_use(history, track, stage, assessment.refused)),
         "reasons": Counter(item.reason for item in refused).most_common(),
         "refused": refused,
@@ -256,19 +228,6 @@ def _mode_use(
         yield used | {"reasons": reasons.most_common()}
 
 
-def _scatter(fleet: FleetPrior | None, stage: Stage) -> Iterator[tuple[str, str, float, float]]:
-    """Yield the expected scatter by the description and by the fleet: key, name and both values."""
-    if fleet is None:
-        return
-    names = {
-        "walk": tr("random walk of ln frequency"),
-        "factor": tr("factor on reported errors"),
-        "deviation": tr("deviation of health from its law"),
-    }
-    described, learned = expected_scatter(scatter_prior(stage)), expected_scatter(fleet.scatter)
-    yield from zip(names, names.values(), described, learned, strict=True)
-
-
 def _pace(law: LawPrior, pace: Pace) -> str:
     """Format the prior of the life of a law, or of its rate: median and 90 % interval."""
     low, middle, high = (float(q) for q in pace.quantile(np.array(LEVELS)))
@@ -281,27 +240,6 @@ def _pace(law: LawPrior, pace: Pace) -> str:
     return tr("{rate} per {distance} ({interval})", **own)
 
 
-def _draw_history(
-    assessment: Assessment, content: Mapping[str, Any], add: Callable[..., None]
-) -> None:
-    """Draw modes, spectra over life, covariates and NIS, from `_track_content`."""
-    history, track, waterfall = assessment.history, assessment.track, assessment.waterfall
-    lives: dict[str, Any] = {"history": history, "track": track}
-    for mode in content["seen"]:
-        add(figures.plot_frequencies, "frequency", mode, **lives, mode=mode)
-        add(figures.plot_damping, "damping", mode, **lives, mode=mode)
-    if waterfall is not None and history.has_odometer:
-        moved = None if track is None else covariate_shifts(history, track, assessment.stage)
-        lives |= {"waterfall": waterfall, "moved": moved}
-        add(figures.plot_waterfall, "waterfall", "all", **lives)
-    for one in content["influences"]:
-        if one.values.size:
-            key = "influence", one.covariate, one.mode
-            add(figures.plot_influence, *key, influence=one, history=history)
-    if content["nis"] is not None:
-        add(figures.plot_nis, "nis", "all", track=track)
-
-
 def _mac(assessment: Assessment) -> dict[str, float]:
     """Return the MAC of each mode of the last log with that of the baseline."""
     latest, before = assessment.latest, assessment.compared
@@ -311,49 +249,58 @@ def _mac(assessment: Assessment) -> dict[str, float]:
     return {name: one for name, one in zip(latest.shapes.names, found, strict=True) if one >= 0}
 
 
-def _log_pictures(assessment: Assessment) -> dict[str, tuple[Any, tuple[float, float]]]:
-    """Return what draws the last log beside the one at the baseline, and the size in inches."""
-    latest, before = assessment.latest, assessment.compared
-    found: dict[str, tuple[Any, tuple[float, float]]] = {}
-    if latest and latest.spectra is not None:
-        plot = partial(plot_spectra, summary=latest.spectra, modes=latest.modes, before=before)
-        size = spectra_size(latest.spectra, latest.modes)
-        found["latest"] = partial(plot, stage=assessment.stage), size
-    if latest and latest.shapes is not None:
-        plot = partial(plot_shapes, shapes=latest.shapes, before=before.shapes if before else None)
-        size = shapes_size(latest.shapes, assessment.stage)
-        found |= {"shapes": (partial(plot, stage=assessment.stage), size)} if size[1] else {}
-    return found
-
-
-def _draw_life(
-    assessment: Assessment,
-    prognosis: Prognosis | None,
-    pairs: Iterable[tuple[tuple[str, ...], str, float]],
-    service: Service,
-    add: Callable[..., None],
-) -> None:
-    """Draw health and remaining life, where there are any."""
-    health = assessment.latest_health
+def _plots(
+    assessment: Assessment, service: Service, content: Mapping[str, Any]
+) -> Iterator[tuple[tuple[str, ...], Any]]:
+    """Yield what draws each picture of the machine's life, after its key on the page."""
+    history, track, waterfall = assessment.history, assessment.track, assessment.waterfall
+    health, prognosis = assessment.latest_health, content["prognosis"]
     specs = {spec.name: spec for spec in assessment.stage.parameters}
-    for names, title, _ in pairs:
-        add(figures.plot_posterior, "posterior", title, health=health, parameters=names)
-    for name in () if health is None else health.parameters:
-        own: Any = {"health": health, "parameter": name, "limit": limit_of(specs[name])}
-        add(figures.plot_health, "health", name, **own)
-    if prognosis is not None:
-        for name in prognosis.parameters[:-1]:
-            own = {"parameter": name, "baseline": specs[name].baseline}
-            add(figures.plot_life, "life", name, prognosis=prognosis, **own)
-        add(figures.plot_survival, "survival", "any", prognosis=prognosis, service=service)
+    lives: dict[str, Any] = {"history": history, "track": track}
+    for mode in content["seen"]:
+        yield ("frequency", mode), partial(figures.plot_frequencies, mode=mode, **lives)
+        yield ("damping", mode), partial(figures.plot_damping, mode=mode, **lives)
+    if waterfall is not None and history.has_odometer:
+        lives["moved"] = track and covariate_shifts(history, track, assessment.stage)
+        yield ("waterfall", "all"), partial(figures.plot_waterfall, waterfall=waterfall, **lives)
+    for one in chain.from_iterable(content["corrected"].values()):
+        plot = partial(figures.plot_influence, influence=one, history=history)
+        yield ("influence", one.covariate, one.mode), plot
+    if track and content["nis"]:
+        yield ("nis", "all"), partial(figures.plot_nis, track=track)
+    for names, title, _ in content["pairs"]:
+        plot = partial(figures.plot_posterior, health=health, parameters=names)
+        yield ("posterior", title), plot
+    for name in health.parameters if health else ():
+        plot = partial(figures.plot_health, health=health, limit=limit_of(specs[name]))
+        yield ("health", name), partial(plot, parameter=name)
+    for name in prognosis.parameters[:-1] if prognosis else ():
+        plot = partial(figures.plot_life, prognosis=prognosis, baseline=specs[name].baseline)
+        yield ("life", name), partial(plot, parameter=name)
+    if prognosis:
+        plot = partial(figures.plot_survival, prognosis=prognosis, service=service)
+        yield ("survival", "any"), plot
 
 
-def _pairs(health: Health) -> Iterator[tuple[tuple[str, ...], str, float]]:
+def _log_pictures(assessment: Assessment) -> Iterator[tuple[str, Any, tuple[float, float]]]:
+    """Yield what draws the last log beside the one at the baseline, and the size in inches."""
+    latest, before, stage = assessment.latest, assessment.compared, assessment.stage
+    if latest and latest.spectra:
+        plot: Any = partial(plot_spectra, modes=latest.modes, stage=stage, before=before)
+        size = spectra_size(latest.spectra, latest.modes)
+        yield "latest", partial(plot, summary=latest.spectra), size
+    if latest and latest.shapes and (size := shapes_size(latest.shapes, stage))[1]:
+        plot = partial(plot_shapes, shapes=latest.shapes, stage=stage)
+        yield "shapes", partial(plot, before=before and before.shapes), size
+
+
+def _pairs(health: Health | None) -> Iterator[tuple[tuple[str, ...], str, float]]:
     """Yield parameters to draw against each other, the title and their correlation."""
-    names = health.parameters
+    names = health.parameters if health else ()
     if len(names) == 1:
         yield names, spell(names[0]), 0.0
     for i, j in combinations(range(len(names)), 2):
+        assert health is not None
         title = tr("{one} against {other}", one=spell(names[i]), other=spell(names[j]))
         yield (names[i], names[j]), title, float(health.correlation[-1, i, j])
 
@@ -428,10 +375,6 @@ def write_index(
     content = render(
         "index.html.j2",
         rows=ranked,
-        headline=text.headline,
-        verdict_text=text.verdict_text,
-        due=text.service_on_day,
-        silent=sum(one.unknown for one in ranked),
         today=today,
         parameters=list(dict.fromkeys(own.name for one in ranked for own in one.health)),
         states=Counter(one.state for one in ranked),
@@ -441,7 +384,6 @@ def write_index(
         newest=newest,
         refused=by_reason,
         gone=[(one, (folder / one.page).exists()) for one in gone],
-        fold=len(refused) > constants.REFUSED_UNFOLDED,
         script=script,
     )
     path = folder / "index.html"

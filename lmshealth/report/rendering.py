@@ -25,9 +25,7 @@ from lmshealth.report import constants, language, text
 
 def render(template: str, /, **content: Any) -> str:
     """Render a template with the values of its names."""
-    version = metadata.version("lmshealth")
-    page = _environment().get_template(template)
-    return str(page.render(content, version=version))
+    return str(_environment().get_template(template).render(content))
 
 
 def read(name: str) -> str:
@@ -58,9 +56,10 @@ def _environment() -> Any:
             with suppress(OSError):  # a full disk
                 super().dump_bytecode(bucket)
 
+    version = metadata.version("lmshealth")
     try:
-        versions = f"{metadata.version('lmshealth')}-{jinja2.__version__}"
-        compiled: Any = Compiled(pattern=f"__lmshealth_{versions}_%s.cache")
+        pattern = f"__lmshealth_{version}-{jinja2.__version__}_%s.cache"
+        compiled: Any = Compiled(pattern=pattern)
     except (OSError, RuntimeError):  # no such folder
         compiled = None
     pages = jinja2.Environment(
@@ -70,14 +69,13 @@ def _environment() -> Any:
         undefined=jinja2.StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,
-        extensions=["jinja2.ext.i18n"],
     )
-    pages.install_gettext_callables(_translated, _counted)  # type: ignore[attr-defined]
     pages.filters |= dict(inspect.getmembers(text, inspect.isfunction))
     pages.filters |= {"place": place, "sha256": sha256, "translated_svg": translated_svg}
     pages.filters |= {name: getattr(language, name) for name in ("sentence", "is_known", "label")}
     pages.globals |= {"covariate": text.covariate, "constants": constants, "tables": TABLES}
-    pages.globals |= {"language": language.language, "_n": _counted, "not_logs": NOT_LOGS}
+    pages.globals |= {"language": language.language, "_": _translated, "_n": _counted}
+    pages.globals |= {"version": version, "not_logs": NOT_LOGS}
     return pages
 
 
@@ -93,8 +91,6 @@ def _counted(one: str, many: str, n: int, /, **values: Any) -> Any:
 
 def translated_svg(svg: Any) -> Any:
     """Translate the labels of a figure (Markup) that was drawn in English."""
-    if language.language() == "en":
-        return svg
     label = language.label
     return Markup(re.sub(r">([^<>]+)</text>", lambda found: f">{label(found[1])}</text>", svg))  # noqa: S704
 

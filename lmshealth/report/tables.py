@@ -53,8 +53,7 @@ def join_csv(parts: Sequence[Any], read: Callable[[Any], str] = str) -> Iterator
     columns: dict[str, None] = {}
     for part in parts:
         columns |= dict.fromkeys(next(csv.reader(io.StringIO(read(part), newline=""))))
-    header = _lines([columns])
-    yield header
+    yield (header := _lines([columns]))
     for part in parts:
         text = read(part)
         if text.startswith(header):
@@ -80,8 +79,10 @@ def log_tables(reading: LogEstimates) -> dict[str, str]:
         for a, b in combinations(range(len(names)), 2)
         if modes.cov[a, b] != 0
     ]
-    rows = {"modes": modes_rows(reading), "modes_cov": cov}
-    return {name: csv_text(name, own) for name, own in rows.items()}
+    return {
+        "modes": csv_text("modes", modes_rows(reading)),
+        "modes_cov": csv_text("modes_cov", cov),
+    }
 
 
 def machine_tables(assessment: Assessment, summary: Summary) -> dict[str, list[Row]]:
@@ -89,9 +90,7 @@ def machine_tables(assessment: Assessment, summary: Summary) -> dict[str, list[R
     from lmshealth.machine.status import notices  # late: single logs need nothing of lives
     from lmshealth.machine.summary import prognosis_rows
 
-    rows: dict[str, list[Row]] = {}
-    if assessment.track is not None:
-        rows |= track_tables(assessment.track)
+    rows = {} if assessment.track is None else track_tables(assessment.track)
     if assessment.health is not None:
         rows["health"] = to_rows(assessment.health.to_columns())
     if summary.life is not None:
@@ -137,20 +136,19 @@ def shapes_rows(log: str, shapes: ModeShapes) -> tuple[list[Row], list[Row]]:
     Amplitudes and phases in degrees are relative to the largest component; None where the channel
     does not show the mode.
     """
-    rows = []
     if not shapes.channels:
         return [], []
-    amplitude, phase = np.abs(shapes.shapes), np.angle(shapes.shapes, deg=True)
-    for i, complexity in enumerate(shapes.complexity):
-        row = TABLES["shapes"].row(log, shapes.names[i], finite_or_none(complexity))
-        for part, values in (("amplitude", amplitude[i]), ("phase_deg", phase[i])):
-            pairs = zip(shapes.channels, values, strict=True)
-            row |= {f"{part}_{channel}": finite_or_none(value) for channel, value in pairs}
-        rows.append(row)
     names, mac = shapes.names, TABLES["mac"]
-    pairs_ = combinations(range(len(names)), 2)
+    rows = []
+    for name, complexity, own in zip(names, shapes.complexity, shapes.shapes, strict=True):
+        row = TABLES["shapes"].row(log, name, finite_or_none(complexity))
+        for part, values in (("amplitude", np.abs(own)), ("phase_deg", np.angle(own, deg=True))):
+            cells = zip(shapes.channels, values, strict=True)
+            row |= {f"{part}_{channel}": finite_or_none(value) for channel, value in cells}
+        rows.append(row)
     return rows, [
-        mac.row(log, names[i], names[j], finite_or_none(shapes.mac[i, j])) for i, j in pairs_
+        mac.row(log, names[i], names[j], finite_or_none(shapes.mac[i, j]))
+        for i, j in combinations(range(len(names)), 2)
     ]
 
 
@@ -294,14 +292,10 @@ def lines_rows(log: str, lines: Iterable[Line]) -> list[Row]:
 def plan_rows(plans: Sequence[Plan]) -> dict[str, list[Row]]:
     """Return the questions of plans (``detect``), and their answers per length of log."""
     detect, plan = TABLES["detect"], TABLES["plan"]
-    asked = ["parameter", "loss", "power", "false_alarm", "n_baseline", "duration_of_one"]
+    efforts = ((own, effort) for own in plans for effort in own.efforts)
     return {
-        "detect": [detect.row(*(getattr(own, name) for name in asked)) for own in plans],
-        "plan": [
-            plan.row(own.parameter, own.loss, *astuple(effort))
-            for own in plans
-            for effort in own.efforts
-        ],
+        "detect": [detect.read(own, seconds_for_one_log=own.duration_of_one) for own in plans],
+        "plan": [plan.row(own.parameter, own.loss, *astuple(effort)) for own, effort in efforts],
     }
 
 
@@ -309,11 +303,7 @@ def stage_rows(examined: StageCheck, found: Sequence[Diagnostic]) -> dict[str, l
     """Return the results of a check of a stage description, by table."""
     names = [check.name for check in examined.parameters]
     return {
-        "stage": [
-            TABLES["stage"].row(
-                examined.name, examined.model_std, examined.n_logs, TYPICAL_DURATION
-            )
-        ],
+        "stage": [TABLES["stage"].read(examined, seconds_per_log=TYPICAL_DURATION)],
         "modes": [
             TABLES["stage_modes"].row(
                 *(one.mode.name, one.mode.frequency_hz, *one.searched),

@@ -19,7 +19,7 @@ from lmshealth.report.language import decimal, mark, mark_either, sentence, tr, 
 
 if TYPE_CHECKING:  # above, so that --help needs no scipy
     from lmshealth.machine.service import Service
-    from lmshealth.machine.summary import NextStep, Summary
+    from lmshealth.machine.summary import Life, NextStep, Summary
 
 
 _KM = 1000.0
@@ -28,21 +28,16 @@ _UNITS = {"c": "°C", "kg": "kg", "mm": "mm", "db": "dB", "percent": "%"}
 
 Number = float | np.floating[Any]
 
-# Names in the shipped descriptions, and of covariates.
-_NAMES = (
+# Names in the shipped descriptions, and of covariates; conditions of a state by NAMUR NE 107, kinds
+# of events and of spectral lines, and labels of the pictures of how-to-read.html.
+_WORDS = (
     *(mark("guide preload"), mark("mount stiffness"), mark("any limit"), mark("roll")),
     *(mark("pitch"), mark("yaw"), mark("temperature"), mark("payload"), mark("position")),
-)
-# Conditions of a state by NAMUR NE 107, kinds of events and of spectral lines, and labels of the
-# pictures of how-to-read.html.
-_WORDS = (
     *(mark("limit reached"), mark("alarm"), mark("step"), mark("outside map"), mark("large drift")),
     *(mark("unreliable"), mark("loss"), mark("service due"), mark("no verdict"), mark("silent")),
     *(mark("no log since maintenance"), mark("inspection overdue"), mark("regreasing")),
-    mark("unconfirmed jump"),
-    *(mark("mains"), mark("reset"), mark("and"), mark("worn"), mark("epochs, 90 %")),
-    *(mark("below"), mark("above")),
-    mark("each epoch by itself"),
+    *(mark("unconfirmed jump"), mark("mains"), mark("reset"), mark("and"), mark("worn")),
+    *(mark("epochs, 90 %"), mark("below"), mark("above"), mark("each epoch by itself")),
 )
 _COUNTED = {
     "log": mark_either("{n} log", "{n} logs"),
@@ -151,10 +146,9 @@ def signed(value: Number, digits: int) -> str:
 
 def percent(share: Number, digits: int | None = None) -> str:
     """Format a share in percent: fixed decimals, or three significant digits; NaN is a dash."""
-    if np.isnan(share):
-        return "–"
     value = 100 * float(share)
-    return f"{number(value) if digits is None else fixed(value, digits)}{GAP}%"
+    words = number(value) if digits is None else fixed(value, digits)
+    return words if np.isnan(value) else f"{words}{GAP}%"
 
 
 def share(value: Number, digits: int) -> str:
@@ -333,17 +327,14 @@ def verdict_text(summary: Summary) -> str:
     if summary.step.partial and summary.life:
         names = joined(map(spell, summary.life.undetermined))
         texts["healthy"] = tr("healthy as far as the modes show, {names} not known", names=names)
-    words = texts.get(summary.verdict) or tr(
-        "loss of {names}", names=joined(map(spell, summary.lost))
-    )
+    loss = tr("loss of {names}", names=joined(map(spell, summary.lost)))
+    words = texts.get(summary.verdict, loss)
     if not summary.deviates:
         return words
     if summary.deviates == ("all",):
         return tr("{verdict} before the last log, which deviates", verdict=words)
-    names = joined(map(spell, summary.deviates))
-    return tr(
-        "{verdict} before the last log, which deviates in {names}", verdict=words, names=names
-    )
+    own = {"verdict": words, "names": joined(map(spell, summary.deviates))}
+    return tr("{verdict} before the last log, which deviates in {names}", **own)
 
 
 def headline(summary: Summary) -> str:
@@ -359,8 +350,7 @@ def headline(summary: Summary) -> str:
         return tr("Healthy at the last log, but the service is due")
     if summary.alarmed:
         return tr("Alarm: unexplained change of {names}", names=joined(map(spell, summary.alarmed)))
-    words = verdict_text(summary)
-    return words[0].upper() + words[1:]
+    return capitalize(verdict_text(summary))
 
 
 NONE_SHOWN = mark("none by what the modes show")
@@ -378,13 +368,13 @@ def service_on_day(summary: Summary) -> str:
         words = service_text(summary.service)
     if summary.step.kind == "check-loss":
         return tr("{service}, unless it was repaired", service=words)
-    if summary.service.kind == "later" and summary.unknown:
+    if summary.service.kind != "later":
+        return words
+    if summary.unknown:
         return tr("unknown without a log")
-    if summary.service.kind == "later" and summary.step.kind in ("inspect", "find-cause"):
+    if summary.step.kind in ("inspect", "find-cause"):
         return tr("open until the cause is found")
-    if summary.service.kind == "later" and summary.step.partial:
-        return tr(NONE_SHOWN)
-    return words
+    return tr(NONE_SHOWN) if summary.step.partial else words
 
 
 # Work that restores a parameter; of any other: work on it.
@@ -439,24 +429,7 @@ def changes(before: Summary, now: Summary) -> Iterator[str]:
         yield tr("Verdict: still {now}, before {probability}.", now=present, probability=earlier)
     yield from _health_changes(before, now)
     if before.life is not None or now.life is not None:
-        low, middle, high = (
-            [
-                travel_left(life.any.travel[k], life.horizon) if life else tr("not known")
-                for life in (before.life, now.life)
-            ]
-            for k in (0, 3, 6)  # quantiles of 5, 50 and 95 %
-        )
-        spread = f" (90{GAP}%: {ends(low[1], high[1])})" if now.life and low[1] != high[1] else ""
-        of_limits = [
-            {one.parameter for one in x.life.limits} if x.life else None for x in (before, now)
-        ]
-        if None in of_limits or of_limits[0] == of_limits[1]:
-            yield tr("Remaining life, median: {change}.", change=f"{_from_to(*middle)}{spread}")
-        else:
-            yield tr(
-                "Remaining life, median: {life}; before, it was until other limits.",
-                life=f"{middle[1]}{spread}",
-            )
+        yield _life_change(before.life, now.life)
     if before.service.by is not None or now.service.by is not None:
         yield _service_change(before.service, now.service)
     more, travel = now.n_logs - before.n_logs, now.travel - before.travel
@@ -485,6 +458,22 @@ def _health_changes(before: Summary, now: Summary) -> Iterator[str]:
         own = present.get(name)
         spread = f" (90{GAP}%: {interval(own.low, own.high)})" if own else ""
         yield f"{capitalize(spell(name))}: {' → '.join(medians)}{spread}."
+
+
+def _life_change(before: Life | None, now: Life | None) -> str:
+    low, middle, high = (
+        [
+            travel_left(life.any.travel[k], life.horizon) if life else tr("not known")
+            for life in (before, now)
+        ]
+        for k in (0, 3, 6)  # quantiles of 5, 50 and 95 %
+    )
+    spread = f" (90{GAP}%: {ends(low[1], high[1])})" if now and low[1] != high[1] else ""
+    limits = [{one.parameter for one in life.limits} for life in (before, now) if life]
+    if len(limits) == 2 and limits[0] != limits[1]:
+        words = tr("Remaining life, median: {life}; before, it was until other limits.")
+        return words.format(life=f"{middle[1]}{spread}")
+    return tr("Remaining life, median: {change}.", change=f"{_from_to(*middle)}{spread}")
 
 
 def _service_change(before: Service, now: Service) -> str:

@@ -34,7 +34,7 @@ from lmshealth.machine.summary import summarise
 from lmshealth.report import figures, text
 from lmshealth.report.language import (
     LANGUAGES,
-    _templates,
+    _patterns,
     in_language,
     is_known,
     label,
@@ -162,7 +162,7 @@ def test_pages_need_no_babel(monkeypatch: pytest.MonkeyPatch) -> None:
     """It has the locales of all countries, and is larger than many libraries together."""
     for name in [name for name in sys.modules if name.split(".")[0] == "babel"]:
         monkeypatch.setitem(sys.modules, name, None)
-    _templates.cache_clear()
+    _patterns.cache_clear()
     test_a_sentence_has_the_formats_of_german()
     with in_language("de"):
         assert (text.day(date(2026, 3, 5)), tr_month(date(2026, 3, 5))) == ("05.03.2026", "Mär")
