@@ -64,6 +64,11 @@ def day(value: str) -> date:
     return found
 
 
+def unique(ctx: click.Context, option: click.Parameter, values: tuple[Any, ...]) -> list[Any]:
+    """Return the values of an option, each once."""
+    return list(dict.fromkeys(values))
+
+
 def _band(
     ctx: click.Context, option: click.Parameter, bands: tuple[tuple[float, float], ...]
 ) -> tuple[float, float] | None:
