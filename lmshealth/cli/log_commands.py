@@ -286,18 +286,16 @@ def _check_outputs(given: dict[str, Any]) -> None:
     if given.get("save") and given["stage"] is not None:
         raise click.UsageError("--save writes a first description; with --stage there is one.")
     for option, endings in (("save", ".toml"), ("plot", ".svg, .png or .html")):
-        path, logs = given.get(option), given["logs"]
+        path, n_logs = given.get(option), len(given["logs"])
         if path is None:
             continue
-        if len(logs) != 1 and not (option == "save" and given["merge"]):
-            raise click.UsageError(f"--{option} needs exactly one log; got {len(logs)}.")
-        why = None
+        if n_logs != 1 and not (option == "save" and given["merge"]):
+            raise click.UsageError(f"--{option} needs exactly one log; got {n_logs}.")
         if path.suffix not in re.findall(r"\.\w+", endings):
-            why = f"must end in {endings}"
-        elif option == "save" and path.exists() and not given["overwrite"]:
-            why = "exists; set --overwrite, or choose another name"
-        if why is not None:
-            raise click.BadParameter(f"{path} {why}", param_hint=f"--{option}")
+            raise click.BadParameter(f"{path} must end in {endings}", param_hint=f"--{option}")
+        if option == "save" and path.exists() and not given["overwrite"]:
+            detail = f"{path} exists; set --overwrite, or choose another name"
+            raise click.BadParameter(detail, param_hint="--save")
 
 
 def _save(path: Path, found: LogEstimates, *, odometer: bool = True) -> None:

@@ -46,7 +46,6 @@ from lmshealth.tracking.track import accepted_estimates, outlier_refusals, smoot
 from lmshealth.tracking.track import track as track_modes
 
 Machine = tuple[History, list[Refusal]]
-_TABLES = ("track", "track_cov", "effects", "events", "refused")
 
 
 @options.command(
@@ -79,7 +78,7 @@ def track(table: Path, **given: Any) -> int:
     """
     stage, targets = given["stage"], given | {"track": given["out"]}
     machines, notes, _ = _read(table, given)
-    rows: dict[str, list[Row]] = {name: [] for name in _TABLES}
+    made: list[dict[str, list[Row]]] = []
     with progress_bars(PATIENCE) as progress:
         each = counted(progress, "tracking", machines)
         tracked = [track_modes(history, stage) for history, _ in each]
@@ -88,15 +87,16 @@ def track(table: Path, **given: Any) -> int:
         refused += outlier_refusals(history, found, stage)
         if given["smoothed"]:
             smoothed = smooth(accepted_estimates(history, found), found, stage)
-        own = tables.track_tables(found, smoothed) | {"refused": tables.refused_rows(refused)}
-        for name in _TABLES:
-            rows[name] += own[name]
+        made.append(
+            tables.track_tables(found, smoothed) | {"refused": tables.refused_rows(refused)}
+        )
         notes += _notes(history, refused)
         views.print_track(found)
     print_notes(notes)
-    for name in _TABLES:
+    for name in ("track", "track_cov", "effects", "events", "refused"):
         if targets[name]:
-            write_text(targets[name], tables.csv_text(name, rows[name]))
+            rows = [row for own in made for row in own[name]]
+            write_text(targets[name], tables.csv_text(name, rows))
     return options.SOME_REFUSED if _some_left_out(machines) else 0
 
 
