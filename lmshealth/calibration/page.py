@@ -237,9 +237,7 @@ def _expectations(check: CalibrationCheck, quantities: Sequence[str]) -> Block:
                 ],
                 "Good: no “as described” bar is red. A bar is red if the table calls its intervals "
                 "too narrow or too wide; a blue one may miss its dashed line by chance. "
-                + ("Of machines that never reach a limit, ranks beyond the horizon are drawn at "
-                   "random." if quantity == DAYS else
-                   "Other kinds show what to expect of such lives alone."),
+                f"{_of_kinds(quantity)}",
                 salt=f"coverage-{k}",
             )
             for k, quantity in enumerate(quantities)
@@ -302,6 +300,12 @@ def _assumptions(check: CalibrationCheck) -> Block:
             "states. A machine that differs from its description in another way is not checked.",
         ),
     )
+
+
+def _of_kinds(quantity: str) -> str:
+    if quantity == DAYS:
+        return "Of machines that never reach a limit, ranks beyond the horizon are drawn at random."
+    return "Other kinds show what to expect of such lives alone."
 
 
 def _tested(check: CalibrationCheck, name: str) -> str:
