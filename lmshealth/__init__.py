@@ -6,7 +6,7 @@ raw samples to the service date. All quantities are in SI units.
 
 from importlib import import_module
 from importlib.metadata import version
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from lmshealth._private.result import Result as _Result
 
@@ -91,12 +91,8 @@ _HOMES = {name: module for module, names in _NAMES.items() for name in names.spl
 __all__ = [*_HOMES]
 
 
-def _draw(result: _Result, what: str, ax: Any) -> Any:
-    return import_module(f"{__name__}.report.figures").draw(result, what, ax)
-
-
 # Drawing is above all results, and imported when one is drawn first.
-_Result.draw = staticmethod(_draw)
+_Result.draw = staticmethod(lambda *given: import_module(f"{__name__}.report.figures").draw(*given))
 
 if not TYPE_CHECKING:  # a type checker would accept any attribute otherwise
 

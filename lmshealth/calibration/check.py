@@ -41,6 +41,8 @@ from lmshealth.tracking.constants import FALSE_ALARM_PROBABILITY
 from lmshealth.tracking.history import History
 from lmshealth.tracking.track import accepted_estimates, track
 
+Task = tuple[Kind | None, int]  # of a life: its kind, None for any; its number
+
 DRAWN = "as described"
 """Population of the lives of all kinds, with the probabilities of the description."""
 DAYS = "days left"
@@ -226,9 +228,9 @@ def draw_outcomes(
     if lives < 1:
         raise BadQuestion(f"{lives} lives: needed is at least 1")
     identifiability_of(stage)  # refuses a description without parameters or map
-    kinds = [_kind(stage, schedule, seed, (None, k)) for k in range(lives)]
     least = int(np.ceil(constants.LEAST_OF_KIND * lives))
-    tasks: list[tuple[Kind | None, int]] = [(None, k) for k in range(lives)]
+    tasks: list[Task] = [(None, k) for k in range(lives)]
+    kinds = [_drawn(stage, schedule, seed, task)[1].kind for task in tasks]
     for kind in KINDS:
         if kind == "wearing" and not any(law.names for p in stage.parameters for law in p.laws):
             continue
@@ -240,38 +242,34 @@ def draw_outcomes(
             yield outcome, len(tasks)
 
 
-def _seeds(seed: int, task: tuple[Kind | None, int]) -> list[int]:
+def _seeds(seed: int, task: Task) -> list[int]:
     kind, number = task
     return [seed, 0 if kind is None else 1 + KINDS.index(kind), number]
 
 
-def _kind(stage: Stage, schedule: Schedule, seed: int, task: tuple[Kind | None, int]) -> Kind:
-    """Return the kind of a life that is drawn."""
-    return draw(np.random.default_rng(_seeds(seed, task)), stage, schedule, task[0]).kind
+def _drawn(
+    stage: Stage, schedule: Schedule, seed: int, task: Task
+) -> tuple[np.random.Generator, Life, LifeOutcome]:
+    """Return a life with the generator that drew it, and an outcome without results."""
+    rng = np.random.default_rng(_seeds(seed, task))
+    life = draw(rng, stage, schedule, task[0])
+    return rng, life, LifeOutcome(life.kind, task[0] is None, task[1])
 
 
-def _crashed(
-    stage: Stage, schedule: Schedule, seed: int, task: tuple[Kind | None, int], why: str
-) -> LifeOutcome:
-    kind = _kind(stage, schedule, seed, task)
-    return LifeOutcome(kind, task[0] is None, task[1], failed=why)
+def _crashed(stage: Stage, schedule: Schedule, seed: int, task: Task, why: str) -> LifeOutcome:
+    return msgspec.structs.replace(_drawn(stage, schedule, seed, task)[2], failed=why)
 
 
-def outcome_of(
-    stage: Stage, schedule: Schedule, seed: int, task: tuple[Kind | None, int]
-) -> LifeOutcome:
+def outcome_of(stage: Stage, schedule: Schedule, seed: int, task: Task) -> LifeOutcome:
     """Draw a life of a kind, or of any, by its number; pass it through the chain of real logs."""
-    seeds = _seeds(seed, task)
-    rng = np.random.default_rng(seeds)
-    drawn = draw(rng, stage, schedule, task[0])
-    base = LifeOutcome(drawn.kind, task[0] is None, task[1])
+    rng, drawn, base = _drawn(stage, schedule, seed, task)
     history = drawn.history
     try:
         tracked = track(history, stage)
         if doubt := doubt_of_names(stage, history, tracked):
             return msgspec.structs.replace(base, failed=doubt)
         accepted = accepted_estimates(history, tracked, doubtful=True)
-        posterior = fit_life(accepted, stage, seeds, chains=False)
+        posterior = fit_life(accepted, stage, _seeds(seed, task), chains=False)
         prognosis = prognosis_or_none(posterior, accepted, stage)
         health = health_of(posterior, accepted, stage, (len(history.logs) - 1,))
     except (NotEnoughData, NotConverged, LinAlgError) as why:

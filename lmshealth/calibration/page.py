@@ -133,9 +133,8 @@ def render_page(
     title: str, sub: str, verdict: tuple[str, str, Sequence[str]], blocks: Sequence[Block]
 ) -> str:
     """Render a page: ``good``, ``bad`` or ``open`` with headline and reasons, then its blocks."""
-    state, headline, why = verdict
-    content: dict[str, Any] = {"title": title, "sub": sub, "blocks": blocks}
-    return render("calibration.html.j2", state=state, headline=headline, why=why, **content)
+    content = dict(zip(("state", "headline", "why"), verdict, strict=True))
+    return render("calibration.html.j2", title=title, sub=sub, blocks=blocks, **content)
 
 
 def verdict_of(check: CalibrationCheck) -> tuple[str, str, list[str]]:
@@ -154,8 +153,7 @@ def verdict_of(check: CalibrationCheck) -> tuple[str, str, list[str]]:
         return "open", "No life has a result", [f"None of {drawn} has a posterior."]
     if check.blind:
         faults = "; ".join(map(_spelled, check.blind))
-        why = f"By {drawn} these faults would not be found: {faults}."
-        why = f"{why} Draw more lives."
+        why = f"By {drawn} these faults would not be found: {faults}. Draw more lives."
         return "open", "No fault found, in too few lives to be sure", [why, family]
     why = f"Intervals and ranks of {drawn} agree with what is stated; wrong ones would be found."
     return "good", "The stated uncertainty is right", [why, family]
@@ -182,11 +180,11 @@ def expectation_rows(check: CalibrationCheck) -> list[dict[str, str]]:
         pairs.setdefault((one.kind, one.quantity), []).append(one)
     rows = []
     for (kind, quantity), own in pairs.items():
+        wrong = [f"{percent(x.level)}: {x.verdict}" for x in own if x.verdict != "as stated"]
         row = {"lives": kind, "quantity": _spelled(quantity), "n": str(own[0].n)}
-        row |= {f"{100 * one.level:.0f}{GAP}% hold": _measured(one) for one in own}
-        wrong = [f"{100 * x.level:.0f}{GAP}%: {x.verdict}" for x in own if x.verdict != "as stated"]
+        row |= {f"{percent(one.level)} hold": _measured(one) for one in own}
         row |= {
-            f"median width at {100 * own[-1].level:.0f}{GAP}%": _width(own[-1]),
+            f"median width at {percent(own[-1].level)}": _width(own[-1]),
             "": ", ".join(wrong) or ("as stated" if kind == DRAWN else "not excluded"),
         }
         rows.append(row)
@@ -200,14 +198,16 @@ def _measured(one: Coverage | Rate) -> str:
 
 def rate_rows(rates: Iterable[Rate]) -> list[dict[str, str]]:
     """Return detection and false alarms by kind of life, as texts."""
-    rows = []
-    for one in rates:
-        stated = "" if one.at_most is None else f"at most {percent(one.at_most)}"
-        found = "" if one.median_log is None else f"log {one.median_log:.0f}"
-        shown = f"{_measured(one)}, {one.hits} of {one.n}"
-        row = {"lives": one.kind, "what happens": one.what, "share (95 % interval)": shown}
-        rows.append(row | {"stated": stated, "at (median)": found})
-    return rows
+    return [
+        {
+            "lives": one.kind,
+            "what happens": one.what,
+            "share (95 % interval)": f"{_measured(one)}, {one.hits} of {one.n}",
+            "stated": "" if one.at_most is None else f"at most {percent(one.at_most)}",
+            "at (median)": "" if one.median_log is None else f"log {one.median_log:.0f}",
+        }
+        for one in rates
+    ]
 
 
 def _expectations(check: CalibrationCheck, quantities: Sequence[str]) -> Block:

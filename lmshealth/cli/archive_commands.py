@@ -5,9 +5,8 @@ What runs is imported by each command: their help needs no database, no workers 
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from contextlib import closing
-from datetime import date, datetime
+from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -21,44 +20,44 @@ from lmshealth.report.constants import TERMINAL_ROWS
 if TYPE_CHECKING:
     from lmshealth.batch.ingest import Settings
     from lmshealth.batch.run import RunResult
-    from lmshealth.report.language import Language
     from lmshealth.stage.description import Stage
 
 
-def _run_options(command: Callable[..., Any]) -> Callable[..., Any]:
-    scheduler = click.option(
+_run_options = options.combined(
+    click.argument("logs", type=click.Path(exists=True, file_okay=False, path_type=Path)),
+    options.stage_option(
+        "stages",
+        multiple=True,
+        required=True,
+        help="Stage description: a .toml file or a shipped name; may be given several times.",
+    ),
+    options.out_option(type=options.FOLDER, help="Folder for tables and report."),
+    options.store_option(
+        help="Store of results: sqlite:///PATH or a PostgreSQL database; default a file in --out."
+    ),
+    options.reading_options,
+    options.SECONDS_PER_LOG,
+    options.WORKERS,
+    click.option(
         "--scheduler",
         metavar="ADDRESS",
         help="Run on the Dask cluster with this scheduler. It needs the same version of lmshealth, "
         "and its workers access to the logs under the same paths.",
-    )
-    text = "Stage description: a .toml file or a shipped name; may be given several times."
-    store = "Store of results: sqlite:///PATH or a PostgreSQL database; default a file in --out."
-    added = (
-        click.argument("logs", type=click.Path(exists=True, file_okay=False, path_type=Path)),
-        options.stage_option("stages", multiple=True, required=True, help=text),
-        options.out_option(type=options.FOLDER, help="Folder for tables and report."),
-        options.store_option(help=store),
-        options.reading_options,
-        options.SECONDS_PER_LOG,
-        options.WORKERS,
-        scheduler,
-        options.EPOCHS,
-        options.SEED,
-        options.alert_options,
-        options.LANGUAGE,
-        options.PDF,
-        options.format_option("table", "json"),
-    )
-    for option in reversed(added):
-        command = option(command)
-    return command
+    ),
+    options.EPOCHS,
+    options.SEED,
+    options.alert_options,
+    options.LANGUAGE,
+    options.PDF,
+    options.format_option("table", "json"),
+)
 
 
 def _settings(given: dict[str, Any]) -> Settings:
     from lmshealth.batch.alerts import Alerts
     from lmshealth.batch.ingest import Settings
 
+    del given["layouts"]  # a part of the column map
     alerts = Alerts(**{name: given.pop(name) for name in ("silent_days", "command", "notify")})
     return Settings(**given, alerts=alerts, follow_links=options.follow_links())
 
@@ -99,10 +98,7 @@ def _status(result: RunResult) -> int:
 )
 @_run_options
 @options.TODAY
-@click.pass_context
-def run(
-    ctx: click.Context, /, logs: Path, stages: tuple[Stage, ...], out: Path, **given: Any
-) -> None:
+def run(logs: Path, stages: tuple[Stage, ...], out: Path, **given: Any) -> int:
     """Analyse a folder of logs: tables, verdicts and report. Run again to continue."""
     from lmshealth.batch.run import run as run_pipeline
     from lmshealth.cli import views
@@ -130,7 +126,7 @@ def run(
             terminal.print_line(f"{rest} more changes; changes.csv lists all.")
         terminal.print_line(f"Report: {result.index}")
     _finish(result, pdf)
-    ctx.exit(_status(result))
+    return _status(result)
 
 
 @options.command(
@@ -186,17 +182,7 @@ def watch(logs: Path, stages: tuple[Stage, ...], out: Path, interval: float, **g
 @options.LANGUAGE
 @options.PDF
 @options.TODAY
-@click.pass_context
-def report(
-    ctx: click.Context,
-    /,
-    store: str,
-    out: Path,
-    workers: int,
-    language: Language,
-    pdf: bool,
-    today: date | None,
-) -> None:
+def report(store: str, out: Path, pdf: bool, **given: Any) -> int:
     """Write the pages of all machines in a store, without their logs.
 
     They are those that `run` writes on the same day in the same language, byte for byte.
@@ -206,8 +192,7 @@ def report(
     from lmshealth.batch.store import Store
 
     with terminal.progress_bars() as progress, closing(Store(store, create=False)) as opened:
-        settings = Settings(workers=workers, today=today, language=language)
-        result = write_pages(opened, out, settings, progress)
+        result = write_pages(opened, out, Settings(**given), progress)
     terminal.print_line(f"Report: {result.index}")
     _finish(result, pdf)
-    ctx.exit(_status(result) or (options.SOME_REFUSED if result.notes else 0))
+    return _status(result) or (options.SOME_REFUSED if result.notes else 0)

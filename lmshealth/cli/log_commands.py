@@ -30,7 +30,7 @@ from lmshealth.modal.mode_shapes import mode_shapes
 from lmshealth.modal.naming import compare, name_response, why_unnamed
 from lmshealth.report import tables
 from lmshealth.signal.readings import find_growth, loop_error, read_error
-from lmshealth.stage.description import ModeSpec, Stage
+from lmshealth.stage.description import ModeSpec
 from lmshealth.stage.proposal import moment_of, propose, searches, write_skeleton
 
 Result = TypeVar("Result")
@@ -70,8 +70,7 @@ _PLOT = click.option(
 @options.LAYOUTS
 @options.MOST_MEMORY
 @options.ALLOW_FUTURE
-@click.pass_context
-def init(ctx: click.Context, /, logs: tuple[Path, ...], out: Path, **given: Any) -> None:
+def init(logs: tuple[Path, ...], out: Path, **given: Any) -> int:
     """Propose map.toml, manifest.csv and my-stage.toml from logs.
 
     The column map is proposed from the first log, with the reason of each guess, and tried on all.
@@ -82,15 +81,13 @@ def init(ctx: click.Context, /, logs: tuple[Path, ...], out: Path, **given: Any)
     there = [str(path) for path in files if path.exists()]
     if there and not given["overwrite"]:
         raise click.UsageError(f"{', '.join(there)} would be replaced; set --overwrite or --out.")
-    how = {name: given[name] for name in ("rate", "max_memory", "latest")}
-    layouts = options.layouts()
-    text, guesses = propose(logs[0], **how, layouts=layouts)
+    layouts, how = options.layouts(given), ("rate", "max_memory", "latest")
+    text, guesses = propose(logs[0], **{name: given[name] for name in how}, layouts=layouts)
     rows = [{"column": g.source, "read as": g.target or "-", "why": g.why} for g in guesses]
     terminal.print_table(f"Columns of {logs[0]}", rows, 3)
     columns = replace(decode(text.encode(), ColumnMap), layouts=layouts)
-    ctx.params |= {"logs": logs, "columns": columns}
+    given |= {"logs": logs, "columns": columns}
     first: list[Log] = []
-
     paths = {shown(path): path for path in logs}
 
     def tried(log: Log) -> Row:
@@ -106,15 +103,15 @@ def init(ctx: click.Context, /, logs: tuple[Path, ...], out: Path, **given: Any)
             "remark": f"recorded_at: {remark or 'not found'}",
         }
 
-    found, lost = _each(ctx, tried)
+    found, lost = _each(given, tried)
     if found:
         write_text(map_file, text)
         terminal.print_notes([f"{map_file}: column map, tried on {len(found)} logs"])
         _propose_manifest(sheet, found)
         odometer = any(row["travel_km"] is not None for row in found)
         band = _propose_stage(stage, first[0], odometer)
-        terminal.print_notes(_next_steps(first[0], map_file, band))
-    _exit(ctx, found, lost)
+        terminal.print_notes(_next_steps(first[0], map_file, given["layouts"], band))
+    return _status(found, lost)
 
 
 def _propose_manifest(sheet: Path, rows: list[Row]) -> None:
@@ -133,18 +130,17 @@ def _propose_manifest(sheet: Path, rows: list[Row]) -> None:
     terminal.print_notes([f"{sheet}: {why}"])
 
 
-def _next_steps(log: Log, map_file: Path, band: tuple[int, int] | None) -> list[str]:
+def _next_steps(
+    log: Log, map_file: Path, layouts: Path | None, band: tuple[int, int] | None
+) -> Iterator[str]:
     """Name the commands that read a log by its proposed map."""
     by = {one.kind: one.name for one in reversed(log.channels)}
     what = f"{shlex.quote(log.name)} --columns {shlex.quote(str(map_file))}"
-    if folder := options.layouts_folder():
-        what += f" --layouts {shlex.quote(str(folder))}"
-    steps = [f"next: lmshealth modes {what}" + (f" --band {band[0]} {band[1]}" if band else "")]
+    what += f" --layouts {shlex.quote(str(layouts))}" if layouts else ""
+    yield f"next: lmshealth modes {what}" + (f" --band {band[0]} {band[1]}" if band else "")
     if "current" in by:
-        output = by.get("acceleration", by.get("displacement"))
-        ends = f"--input {by['current']} --output {output}"
-        steps.append(f"or, where a current excites: lmshealth frf {what} {ends}")
-    return steps
+        ends = f"--input {by['current']} --output {by.get('acceleration', by.get('displacement'))}"
+        yield f"or, where a current excites: lmshealth frf {what} {ends}"
 
 
 def _propose_stage(path: Path, log: Log, odometer: bool) -> tuple[int, int] | None:
@@ -172,6 +168,17 @@ def _propose_stage(path: Path, log: Log, odometer: bool) -> tuple[int, int] | No
     return band
 
 
+def _channels(
+    ctx: click.Context, option: click.Parameter, given: tuple[str, ...]
+) -> list[str] | None:
+    """Return the names of lists with commas, each once."""
+    names = dict.fromkeys(name.strip() for listed in given for name in listed.split(","))
+    if "" in names:
+        detail = f"{','.join(given)!r} has an empty name"
+        raise click.BadParameter(detail, param_hint="--channels")
+    return list(names) or None
+
+
 @options.command(
     "modes log.h5 --stage lms-y",
     "modes export.csv --columns map.toml --band 80 200 --format json",
@@ -190,7 +197,7 @@ def _propose_stage(path: Path, log: Log, odometer: bool) -> tuple[int, int] | No
 @click.option(
     "--channels",
     multiple=True,
-    callback=lambda ctx, option, given: _names(",".join(given)) if given else None,
+    callback=_channels,
     help="Use only these channels, separated by commas; may be given several times.",
 )
 @options.band_option("Use only this band, in Hz.")
@@ -209,8 +216,7 @@ def _propose_stage(path: Path, log: Log, odometer: bool) -> tuple[int, int] | No
     help="Merge logs of several set-ups of one machine, whose sensors rove, to one shape per mode.",
 )
 @_FORMAT
-@click.pass_context
-def modes(ctx: click.Context, /, **given: Any) -> None:
+def modes(**given: Any) -> int:
     """Identify the modes of single logs: natural frequency and damping ratio.
 
     json also lists complex mode shapes, their phase collinearity (MPC), the modal assurance
@@ -224,11 +230,11 @@ def modes(ctx: click.Context, /, **given: Any) -> None:
         # Late: help and refusals of files need none of it.
         from lmshealth.modal.identification import read_ambient, read_decays, read_modes
 
-        read = read_ambient if given["part"] == "constant" else read_modes
         if given["part"] == "settling":
             reading = read_decays(log, stage, **chosen)
         else:
-            reading = read(log, stage, **chosen, progress=ctx.obj)
+            read = read_ambient if given["part"] == "constant" else read_modes
+            reading = read(log, stage, **chosen, progress=given["progress"])
         if given["plot"]:
             from lmshealth.report import log_figures  # late: most commands draw nothing
 
@@ -238,47 +244,41 @@ def modes(ctx: click.Context, /, **given: Any) -> None:
         own = log.name, log.digest, log.metadata, reading.modes, loop_error(log)
         return LogEstimates(*own, shapes=shapes, sample_rate=log.sample_rate)
 
-    found, lost = _each(ctx, estimate)
+    found, lost = _each(given, estimate)
     if given["merge"] and found:
         from lmshealth.modal.setups import merge_setups
 
         found = [merge_setups(found)]
-    content = _modes_content(found, stage)
+    shapes = [tables.shapes_rows(one.log, one.shapes) for one in found if one.shapes]
+    of_shapes, of_mac = ([row for own in shapes for row in own[k]] for k in (0, 1))
+    content = _estimates_content(found, shapes=of_shapes, mac=of_mac)
+    off = TABLES["off_description"]
+    differing = [
+        row for one in found if stage for row in off.rows_of(compare(one.modes, stage), log=one.log)
+    ]
+    content |= {"off_description": differing} if differing else {}
     refused = [refusal for one in found for refusal in one.modes.refused]
 
     def show(rejected: list[Row]) -> None:
-        views.print_modes(content["modes"], rejected, content.get("off_description", ()))
+        views.print_modes(content["modes"], rejected, differing)
         if given["shapes"]:
-            views.print_shapes(content["shapes"], content["mac"])
+            views.print_shapes(of_shapes, of_mac)
         if content["modes"] and stage is None and band is None:
             terminal.print_text(_NO_BAND)
 
-    _finish(ctx, content, refused, found, lost, show)
+    return _finish(given, content, refused, found, lost, show)
 
 
-def _modes_content(found: Sequence[LogEstimates], stage: Stage | None) -> dict[str, list[Row]]:
-    """Return the rows of what the command `modes` prints, by table."""
-    names = "modes", "lines", "shapes", "mac", "std_factors"
-    content: dict[str, list[Row]] = {name: [] for name in names}
-    for one in found:
-        assert one.shapes is not None, "as the command estimates them"
-        shapes, mac = tables.shapes_rows(one.log, one.shapes)
-        content["modes"] += tables.modes_rows(one)
-        content["lines"] += tables.lines_rows(one.log, one.modes.lines)
-        content["shapes"] += shapes
-        content["mac"] += mac
-        content["std_factors"] += tables.factor_rows(one.log, one.modes)
-    off = TABLES["off_description"]
-    rows = [row for r in found if stage for row in off.rows_of(compare(r.modes, stage), log=r.log)]
-    return content | ({"off_description": rows} if rows else {})
-
-
-def _names(listed: str) -> list[str]:
-    """Return the names of a list with commas, each once."""
-    names = dict.fromkeys(name.strip() for name in listed.split(","))
-    if "" in names:
-        raise click.BadParameter(f"{listed!r} has an empty name", param_hint="--channels")
-    return list(names)
+def _estimates_content(
+    estimates: Sequence[LogEstimates], **shapes: list[Row]
+) -> dict[str, list[Row]]:
+    """Return the rows of estimates, and those of their shapes, by table."""
+    return {
+        "modes": [row for one in estimates for row in tables.modes_rows(one)],
+        "lines": [row for one in estimates for row in tables.lines_rows(one.log, one.modes.lines)],
+        **shapes,
+        "std_factors": [row for one in estimates for row in tables.factor_rows(one.log, one.modes)],
+    }
 
 
 def _check_outputs(given: dict[str, Any]) -> None:
@@ -286,18 +286,16 @@ def _check_outputs(given: dict[str, Any]) -> None:
     if given.get("save") and given["stage"] is not None:
         raise click.UsageError("--save writes a first description; with --stage there is one.")
     for option, endings in (("save", ".toml"), ("plot", ".svg, .png or .html")):
-        path, logs = given.get(option), given["logs"]
+        path, n_logs = given.get(option), len(given["logs"])
         if path is None:
             continue
-        if len(logs) != 1 and not (option == "save" and given["merge"]):
-            raise click.UsageError(f"--{option} needs exactly one log; got {len(logs)}.")
-        why = None
+        if n_logs != 1 and not (option == "save" and given["merge"]):
+            raise click.UsageError(f"--{option} needs exactly one log; got {n_logs}.")
         if path.suffix not in re.findall(r"\.\w+", endings):
-            why = f"must end in {endings}"
-        elif option == "save" and path.exists() and not given["overwrite"]:
-            why = "exists; set --overwrite, or choose another name"
-        if why is not None:
-            raise click.BadParameter(f"{path} {why}", param_hint=f"--{option}")
+            raise click.BadParameter(f"{path} must end in {endings}", param_hint=f"--{option}")
+        if option == "save" and path.exists() and not given["overwrite"]:
+            detail = f"{path} exists; set --overwrite, or choose another name"
+            raise click.BadParameter(detail, param_hint="--save")
 
 
 def _save(path: Path, found: LogEstimates, *, odometer: bool = True) -> None:
@@ -332,21 +330,20 @@ def _save(path: Path, found: LogEstimates, *, odometer: bool = True) -> None:
 @options.PART
 @options.reading_options
 @_FORMAT
-@click.pass_context
-def error(ctx: click.Context, /, **given: Any) -> None:
+def error(**given: Any) -> int:
     """Analyse the following error: statistics, strongest harmonics, bandwidth.
 
     Statistics are of all samples, harmonics of the longest segment without gaps. The sum of the
     listed harmonics (json) reconstructs the following error.
     """
     analysis = {"count": given["count"], "floor": 1e-9 * given["floor_nm"], "part": given["part"]}
-    found, lost = _each(ctx, lambda log: (log, read_error(log, **analysis)))
+    found, lost = _each(given, lambda log: (log, read_error(log, **analysis)))
     pairs = [(log.name, one) for log, own in found for one in own]
     rows = [tables.error_row(*pair) for pair in pairs]
     harmonics = [row for pair in pairs for row in tables.harmonics_rows(*pair)]
     refused = [refusal for log, _ in found for refusal in log.refused]
     show = partial(views.print_error, rows, harmonics)
-    _finish(ctx, {"error": rows, "harmonics": harmonics}, refused, found, lost, show)
+    return _finish(given, {"error": rows, "harmonics": harmonics}, refused, found, lost, show)
 
 
 @options.command(
@@ -360,8 +357,7 @@ def error(ctx: click.Context, /, **given: Any) -> None:
 @options.PART
 @options.reading_options
 @_FORMAT
-@click.pass_context
-def spectrum(ctx: click.Context, /, **given: Any) -> None:
+def spectrum(**given: Any) -> int:
     """Measure accelerations per mode and velocity, and which of them grow with velocity.
 
     With a stage: its modes, and the RMS in its health band and watched bands; without: a grid of
@@ -371,7 +367,7 @@ def spectrum(ctx: click.Context, /, **given: Any) -> None:
     from lmshealth.modal.acceleration_survey import survey
 
     stage, band, part = given["stage"], given["band"], given["part"]
-    found, lost = _each(ctx, lambda log: survey(log, stage, band, part=part))
+    found, lost = _each(given, lambda log: survey(log, stage, band, part=part))
     magnitudes = [item for own in found for item in own.magnitudes]
     growth = find_growth(magnitudes)
     of_logs = [(own.log, line) for own in found for line in own.lines]
@@ -380,7 +376,7 @@ def spectrum(ctx: click.Context, /, **given: Any) -> None:
     refused = [refusal for own in found for refusal in own.refused]
     content = {"magnitudes": rows, "growth": tables.growth_rows(growth), "lines": lines}
     show = partial(views.print_magnitudes, rows, lines)
-    _finish(ctx, content, refused, found, lost, show)
+    return _finish(given, content, refused, found, lost, show)
 
 
 @options.command(
@@ -424,8 +420,7 @@ def spectrum(ctx: click.Context, /, **given: Any) -> None:
 @options.reading_options
 @_PLOT
 @_FORMAT
-@click.pass_context
-def frf(ctx: click.Context, /, **given: Any) -> None:
+def frf(**given: Any) -> int:
     """Measure the frequency response between two channels and identify its modes.
 
     A periodic input is averaged over whole periods, blows of a hammer over blows (double hits and
@@ -453,7 +448,7 @@ def frf(ctx: click.Context, /, **given: Any) -> None:
         impact = given["impact"]
         return log, read_frf(log, source, output, band=band, period=period, impact=impact)
 
-    found, lost = _each(ctx, analyse, partial(_responses, source, output))
+    found, lost = _each(given, analyse, partial(_responses, source, output))
     if given["plot"] and len(found) > 1:
         raise click.UsageError(f"--plot draws one of {len(found)} responses; choose by --output.")
     estimates = []
@@ -465,22 +460,16 @@ def frf(ctx: click.Context, /, **given: Any) -> None:
 
             figure = log_figures.response_figure(log, own, named, stage)
             log_figures.write_figure(given["plot"], figure)
-    rows = [row for one in estimates for row in tables.modes_rows(one)]
-    content = {
-        "modes": rows,
-        "fit": [tables.fit_row(log.name, own) for log, own in found],
-        "frf": [row for log, own in found for row in tables.frf_rows(log.name, own)],
-        "lines": [
-            row for log, own in found for row in tables.lines_rows(log.name, own.modes.lines)
-        ],
-        "std_factors": [row for e in estimates for row in tables.factor_rows(e.log, e.modes)],
-    }
+    fits = [tables.fit_row(log.name, own) for log, own in found]
+    responses = [row for log, own in found for row in tables.frf_rows(log.name, own)]
+    # The first table is that of csv.
+    content = {"modes": [], "fit": fits, "frf": responses} | _estimates_content(estimates)
     refused = [refusal for _, own in found for refusal in own.modes.refused]
     if stage and given["style"] != "json":
         notes = [f"{one.log}: {why}" for one in estimates for why in why_unnamed(one.modes, stage)]
         terminal.print_notes(notes)
-    show = partial(views.print_frf, content["fit"], content["frf"], rows)
-    _finish(ctx, content, refused, found, lost, show)
+    show = partial(views.print_frf, fits, responses, content["modes"])
+    return _finish(given, content, refused, found, lost, show)
 
 
 def _responses(
@@ -505,43 +494,43 @@ def _responses(
 
 
 def _finish(
-    ctx: click.Context,
+    given: dict[str, Any],
     content: dict[str, list[Row]],
     refused: Sequence[Refusal],
     found: Sequence[Any],
     lost: Sequence[Refusal],
     show: Callable[[list[Row]], None],
-) -> None:
-    """Print results as csv (the first table of the content), json, or tables; save them, and exit.
+) -> int:
+    """Print results as csv (the first table of the content), json, or tables; save them.
 
-    Tables list refused parts of logs, but not lost logs.
+    Tables list refused parts of logs, but not lost logs. Return the exit status.
     """
-    if ctx.params["style"] == "csv":
+    if given["style"] == "csv":
         name, rows = next(iter(content.items()))
         click.echo(tables.csv_text(name, rows), nl=False)
-    elif ctx.params["style"] == "json":
+    elif given["style"] == "json":
         terminal.print_json({**content, "refused": tables.refused_rows([*lost, *refused])})
     elif found:
         show(tables.refused_rows(refused))
-    if ctx.params.get("save") and found:
-        _save(ctx.params["save"], found[0])
-    _exit(ctx, found, lost)
+    if given.get("save") and found:
+        _save(given["save"], found[0])
+    return _status(found, lost)
 
 
 def _each(
-    ctx: click.Context,
+    given: dict[str, Any],
     analyse: Callable[[Any], Result],
-    read: Callable[..., list[Any]] | None = None,
+    read: Callable[..., list[Any]] = lambda path, **reading: [read_log(path, **reading)],
 ) -> tuple[list[Result], list[Refusal]]:
     """Analyse one log after the other; return results and refused logs.
 
-    ``read`` reads what a file holds, where that is not one log. ``ctx.obj`` reports progress.
+    ``read`` reads what a file holds. ``given["progress"]`` is set to report progress.
     """
     found: list[Result] = []
     lost: list[Refusal] = []
     manifests: dict[Path, Manifest] = {}
-    reading = {name: ctx.params[name] for name in ("columns", "max_memory", "latest")}
-    named = ctx.params["logs"]
+    reading = {name: given[name] for name in ("columns", "max_memory", "latest")}
+    named = given["logs"]
     # A pattern such as *.csv does not mean the manifest in the same folder.
     paths = [path for path in named if path.name not in NOT_LOGS] or named
     paths = list({path.absolute(): path for path in paths}.values())  # a log is used once
@@ -551,33 +540,30 @@ def _each(
             beside = manifests[path.parent] = read_manifest_beside(path)
             faults = [refusal for refusal in beside.refused if refusal.log == MANIFEST]
             terminal.print_notes(_sentences(faults))
-        more = reading | {"overrides": manifests[path.parent].overrides(path)}
-        logs = [read_log(path, **more)] if read is None else read(path, **more)
-        terminal.print_notes(
-            f"{log.name} is read with {', '.join(log.guessed)}; [csv] of a column map overrides"
-            for log in logs
-            if isinstance(log, Log) and log.guessed
-        )
-        low, high = ctx.params.get("band") or (0.0, 0.0)
-        terminal.print_notes(
-            f"{log.name}: the band {low:g} to {high:g} Hz ends above {log.sample_rate / 2:g} Hz, "
-            "half the sample rate: nothing is seen there"
-            for log in logs
-            if isinstance(log, Log) and low < log.sample_rate / 2 < high
-        )
+        logs = read(path, **reading, overrides=manifests[path.parent].overrides(path))
+        for log in logs:
+            if isinstance(log, Log):
+                terminal.print_notes(_remarks(log, *(given.get("band") or (0.0, 0.0))))
         return logs
 
-    with terminal.progress_bars(terminal.PATIENCE) as ctx.obj:
-        for k, path in enumerate(paths):
-            ctx.obj("logs", k, len(paths))
-            there: list[Any] = []
+    with terminal.progress_bars(terminal.PATIENCE) as given["progress"]:
+        for path in terminal.counted(given["progress"], "logs", paths):
             with _refusing(lost):
-                there = items(path)
-            for item in there:
-                with _refusing(lost):
-                    found.append(analyse(item))
-        ctx.obj("logs", len(paths), len(paths))
+                for item in items(path):
+                    with _refusing(lost):
+                        found.append(analyse(item))
     return found, lost
+
+
+def _remarks(log: Log, low: float, high: float) -> Iterator[str]:
+    """Yield what was guessed of a log, and whether a band in Hz ends above what it shows."""
+    if log.guessed:
+        yield f"{log.name} is read with {', '.join(log.guessed)}; [csv] of a column map overrides"
+    if low < (most := log.sample_rate / 2) < high:
+        yield (
+            f"{log.name}: the band {low:g} to {high:g} Hz ends above {most:g} Hz, half the sample "
+            "rate: nothing is seen there"
+        )
 
 
 @contextmanager
@@ -593,6 +579,7 @@ def _sentences(refused: Sequence[Refusal]) -> list[str]:
     return [f"{refusal.log}: {refusal.reason}: {refusal.detail}" for refusal in refused]
 
 
-def _exit(ctx: click.Context, found: Sequence[object], lost: Sequence[Refusal]) -> None:
+def _status(found: Sequence[object], lost: Sequence[Refusal]) -> int:
+    """Print which logs are lost, and why; return the exit status."""
     terminal.print_errors(_sentences(lost))
-    ctx.exit(0 if not lost else options.SOME_REFUSED if found else 1)
+    return 0 if not lost else options.SOME_REFUSED if found else 1

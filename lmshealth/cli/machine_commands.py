@@ -1,7 +1,7 @@
 """Commands that continue from tables of estimates: track, infer, prognose."""
 
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +13,14 @@ from lmshealth._private.files import write_draws, write_text
 from lmshealth._private.serialize import seed_of
 from lmshealth._private.tables import Row
 from lmshealth.cli import options, views
-from lmshealth.cli.terminal import PATIENCE, print_errors, print_notes, progress_bars
+from lmshealth.cli.terminal import (
+    PATIENCE,
+    Report,
+    counted,
+    print_errors,
+    print_notes,
+    progress_bars,
+)
 from lmshealth.errors import NotConverged, NotEnoughData
 from lmshealth.io.log import Refusal, utc_day
 from lmshealth.life.health import Health, epochs_to_publish, health_of, infer_drifts
@@ -38,9 +45,7 @@ from lmshealth.tracking.read_tables import has_drifts, read_drifts, read_machine
 from lmshealth.tracking.track import accepted_estimates, outlier_refusals, smooth
 from lmshealth.tracking.track import track as track_modes
 
-Progress = Callable[[str, int, int], None]
 Machine = tuple[History, list[Refusal]]
-_TABLES = ("track", "track_cov", "effects", "events", "refused")
 
 
 @options.command(
@@ -64,8 +69,7 @@ _TABLES = ("track", "track_cov", "effects", "events", "refused")
 @click.option(
     "--smooth", "smoothed", is_flag=True, help="Add smoothed columns, which also use later logs."
 )
-@click.pass_context
-def track(ctx: click.Context, /, table: Path, **given: Any) -> None:
+def track(table: Path, **given: Any) -> int:
     """Track modes through a table of estimates of lmshealth or another program.
 
     Required columns: recorded_at, frequency_hz and frequency_std_hz. The clock is travel_km when
@@ -74,28 +78,26 @@ def track(ctx: click.Context, /, table: Path, **given: Any) -> None:
     """
     stage, targets = given["stage"], given | {"track": given["out"]}
     machines, notes, _ = _read(table, given)
-    rows: dict[str, list[Row]] = {name: [] for name in _TABLES}
-    tracked = []
+    made: list[dict[str, list[Row]]] = []
     with progress_bars(PATIENCE) as progress:
-        for k, (history, _) in enumerate(machines):
-            progress("tracking", k, len(machines))
-            tracked.append(track_modes(history, stage))
-        progress("tracking", len(machines), len(machines))
+        each = counted(progress, "tracking", machines)
+        tracked = [track_modes(history, stage) for history, _ in each]
     for (history, refused), found in zip(machines, tracked, strict=True):
         smoothed = None
         refused += outlier_refusals(history, found, stage)
         if given["smoothed"]:
             smoothed = smooth(accepted_estimates(history, found), found, stage)
-        own = tables.track_tables(found, smoothed) | {"refused": tables.refused_rows(refused)}
-        for name in _TABLES:
-            rows[name] += own[name]
+        made.append(
+            tables.track_tables(found, smoothed) | {"refused": tables.refused_rows(refused)}
+        )
         notes += _notes(history, refused)
         views.print_track(found)
     print_notes(notes)
-    for name in _TABLES:
+    for name in ("track", "track_cov", "effects", "events", "refused"):
         if targets[name]:
-            write_text(targets[name], tables.csv_text(name, rows[name]))
-    ctx.exit(options.SOME_REFUSED if _some_left_out(machines) else 0)
+            rows = [row for own in made for row in own[name]]
+            write_text(targets[name], tables.csv_text(name, rows))
+    return options.SOME_REFUSED if _some_left_out(machines) else 0
 
 
 def _some_left_out(machines: Sequence[Machine]) -> bool:
@@ -105,7 +107,8 @@ def _some_left_out(machines: Sequence[Machine]) -> bool:
 
 def _read(table: Path, given: dict[str, Any]) -> tuple[list[Machine], list[str], Maintenance]:
     """Read the machines of a table of estimates, notes on them, and the maintenance of all."""
-    latest, work = given["latest"], read_work(given["maintenance"], given["latest"])
+    latest = given["latest"]
+    work = read_work(given["maintenance"], latest)
     how = {"cross_terms": given["cov"], "work": work, "latest": latest}
     return *read_machines(table, given["stage"], **how), work
 
@@ -118,8 +121,7 @@ def _notes(history: History, refused: list[Refusal]) -> list[str]:
         notes.append("not every log has travel_km: the clock is the time")
     if len(history.logs) == 1:
         notes.append("a single log is the baseline: no drift yet")
-    reasons = Counter(refusal.reason for refusal in refused)
-    if reasons:
+    if reasons := Counter(refusal.reason for refusal in refused):
         listed = ", ".join(f"{count} {reason}" for reason, count in reasons.items())
         notes.append(f"refused: {listed}; --refused FILE lists them")
     return [f"{history.stage}: {note}" for note in notes]
@@ -138,8 +140,7 @@ def _notes(history: History, refused: list[Refusal]) -> list[str]:
 @options.ALLOW_FUTURE
 @options.EPOCHS
 @options.SEED
-@click.pass_context
-def infer(ctx: click.Context, /, table: Path, **given: Any) -> None:
+def infer(table: Path, **given: Any) -> int:
     """Infer the health parameters from a table of estimates, by all logs of a life.
 
     Modes are tracked first, as by `track`; outliers are left out. Every row needs travel_km. From a
@@ -161,12 +162,13 @@ def infer(ctx: click.Context, /, table: Path, **given: Any) -> None:
     for health in found:
         views.print_health(health)
     rows = [row for health in found for row in tables.to_rows(health.to_columns())]
-    some = bool(lost) or _some_left_out(machines)
-    _finish(ctx, "health", rows, {health.stage: health for health in found}, lost, some)
+    return _finish(
+        given, "health", rows, {health.stage: health for health in found}, lost, machines
+    )
 
 
 def _infer_drifts(
-    table: Path, given: dict[str, Any], progress: Progress
+    table: Path, given: dict[str, Any], progress: Report
 ) -> tuple[list[Health], list[str]]:
     """Infer all machines of a table of drifts; return results, and reasons of those without."""
     stage, found, lost = given["stage"], [], []
@@ -177,8 +179,7 @@ def _infer_drifts(
     machines, notes = read_drifts(table, cross_terms=terms, latest=given["latest"])
     print_notes(f"{table}: {note}" for note in notes)
     known = {mode.name for mode in stage.modes}
-    for k, drifts in enumerate(machines):
-        progress("inferring", k, len(machines))
+    for drifts in counted(progress, "inferring", machines):
         strange = sorted(set(drifts.modes) - known)
         if strange and known & set(drifts.modes):  # else health would silently do without them
             why = f"modes {strange} are none of {stage.name}, which has {sorted(known)}"
@@ -189,7 +190,6 @@ def _infer_drifts(
             found.append(infer_drifts(drifts, stage, seed, epochs=given["epochs"]))
         except (NotEnoughData, NotConverged) as why:
             lost.append(str(why))
-    progress("inferring", len(machines), len(machines))
     return found, lost
 
 
@@ -235,8 +235,7 @@ def _machines(table: Path, given: dict[str, Any]) -> tuple[list[Machine], Mainte
     help="Service at least cost, for this cost of a failure over that of a planned service.",
 )
 @options.SEED
-@click.pass_context
-def prognose(ctx: click.Context, /, table: Path, **given: Any) -> None:
+def prognose(table: Path, **given: Any) -> int:
     """Predict the remaining travel and time until each limit, and the service date.
 
     Modes are tracked first, as by `track`; outliers are left out. Every row needs travel_km. Limits
@@ -268,8 +267,8 @@ def prognose(ctx: click.Context, /, table: Path, **given: Any) -> None:
             print_notes([f"{note} is given for that day"])
         views.print_life(life, service, before)
         rows += prognosis_rows(life, service, before)
-    some = bool(lost) or _some_left_out(machines)
-    _finish(ctx, "prognosis", rows, {one.stage: posterior for one, posterior in found}, lost, some)
+    draws = {prognosis.stage: posterior for prognosis, posterior in found}
+    return _finish(given, "prognosis", rows, draws, lost, machines)
 
 
 def _decision(described: Decision, risk: float | None, ratio: float | None) -> Decision:
@@ -282,12 +281,11 @@ def _decision(described: Decision, risk: float | None, ratio: float | None) -> D
 
 
 def _lives(
-    machines: list[Machine], given: dict[str, Any], progress: Progress
+    machines: list[Machine], given: dict[str, Any], progress: Report
 ) -> tuple[list[tuple[History, LifePosterior]], list[str]]:
     """Fit the lives of all machines; return them with accepted logs, and reasons of the others."""
     found, lost, stage = [], [], given["stage"]
-    for k, (history, refused) in enumerate(machines):
-        progress("sampling", k, len(machines))
+    for history, refused in counted(progress, "sampling", machines):
         try:
             tracked = track_modes(history, stage)
             doubt = doubt_of_clock(history, refused) or doubt_of_names(stage, history, tracked)
@@ -300,24 +298,26 @@ def _lives(
             lost.append(str(why))
         except (NotConverged, LinAlgError) as why:
             lost.append(f"{history.stage}: {why}; check the units of odometer and frequencies")
-    progress("sampling", len(machines), len(machines))
     return found, lost
 
 
 def _finish(
-    ctx: click.Context,
+    given: dict[str, Any],
     name: str,
     rows: list[Row],
     draws: Mapping[str, Any],
     lost: Sequence[str],
-    some_refused: bool,
-) -> None:
-    """Write the table and the draws of each machine, print why others have none, and exit."""
+    machines: Sequence[Machine],
+) -> int:
+    """Write the table and the draws of each machine, and print why others have none.
+
+    Return the exit status.
+    """
     print_errors(lost)
     if not rows:
-        ctx.exit(1)
-    write_text(ctx.params["out"], tables.csv_text(name, rows))
-    if ctx.params["posterior"]:
+        return 1
+    write_text(given["out"], tables.csv_text(name, rows))
+    if given["posterior"]:
         trees = [posterior.to_arviz() for posterior in draws.values()]
-        write_draws(ctx.params["posterior"], list(draws), trees)
-    ctx.exit(options.SOME_REFUSED if some_refused else 0)
+        write_draws(given["posterior"], list(draws), trees)
+    return options.SOME_REFUSED if lost or _some_left_out(machines) else 0

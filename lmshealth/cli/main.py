@@ -82,10 +82,8 @@ class _Group(click.Group):
             if ctx.invoked_subcommand == "watch" and number == signal.SIGTERM:
                 ctx.exit(0)  # as a service ends
             by = f" by {signal.Signals(number).name}" if asked else ""
-            # Only a run keeps what is finished.
-            runs = ctx.invoked_subcommand in ("run", "watch")
-            kept = "; run again to continue" if runs else ""
-            print_errors([f"interrupted{by}{kept}"])
+            keeps = ctx.invoked_subcommand in ("run", "watch")  # what is finished
+            print_errors([f"interrupted{by}{'; run again to continue' if keeps else ''}"])
             ctx.exit(128 + number)  # as shells report it
         ctx.exit(1)
 

@@ -24,6 +24,8 @@ from lmshealth.report.language import LANGUAGES
 from lmshealth.signal.segments import PARTS
 from lmshealth.stage.description import Stage, load_stage
 
+Decorator = Callable[[Callable[..., Any]], Callable[..., Any]]
+
 # Exit status: done, but some logs or machines were refused.
 SOME_REFUSED = 3
 # Largest values of options: seeds are stored in 64 bits with a sign, days are those of a century,
@@ -60,6 +62,11 @@ def day(value: str) -> date:
     if not FIRST_MOMENT.date() <= found < LAST_MOMENT.date():
         raise click.BadParameter(f"{value!r} is not a day {MOMENTS}.")
     return found
+
+
+def unique(ctx: click.Context, option: click.Parameter, values: tuple[Any, ...]) -> list[Any]:
+    """Return the values of an option, each once."""
+    return list(dict.fromkeys(values))
 
 
 def _band(
@@ -129,15 +136,17 @@ def described(reference: str) -> Stage:
     return load_stage(reference, follow_links=follow_links())
 
 
-def stage_option(*name: str, **settings: Any) -> Callable[[Callable[..., Any]], Any]:
+def combined(*added: Decorator) -> Decorator:
+    """Return one decorator for arguments and options, in the order of the help."""
+    return lambda command: reduce(lambda inner, option: option(inner), reversed(added), command)
+
+
+def stage_option(
+    *name: str, help: str = "Stage description: a .toml file or a shipped name.", **settings: Any
+) -> Decorator:
     """Return the options ``--stage`` and ``--follow-links``."""
-    given: dict[str, Any] = {
-        "type": described,
-        "metavar": "TEXT",
-        "help": "Stage description: a .toml file or a shipped name.",
-    }
-    option = click.option("--stage", *name, **(given | settings))
-    return lambda command: option(FOLLOW_LINKS(command))
+    option = click.option("--stage", *name, type=described, metavar="TEXT", help=help, **settings)
+    return combined(option, FOLLOW_LINKS)
 
 
 out_option = partial(click.option, "--out", required=True, type=OUT)
@@ -147,33 +156,27 @@ store_option = partial(
 )
 
 
-def layouts() -> tuple[Layout, ...]:
+def layouts(given: dict[str, Any]) -> tuple[Layout, ...]:
     """Load the layouts of ``--layouts``."""
-    folder = layouts_folder()
+    folder = given["layouts"]
     return load_layouts(folder) if folder else ()
-
-
-def layouts_folder() -> Path | None:
-    """Return the folder of ``--layouts``."""
-    folder: Path | None = click.get_current_context().meta.get(_LAYOUTS)
-    return folder
 
 
 def _columns(ctx: click.Context, option: click.Parameter, path: Path | None) -> ColumnMap | None:
     """Load a column map, with the layouts of ``--layouts``; None without both."""
-    own = layouts()
-    if path is None and not own:
-        return None
-    _inputs().extend([path] if path else [])
-    return replace(ColumnMap() if path is None else load_columns(path), layouts=own)
+    own = layouts(ctx.params)
+    if path is None:
+        return replace(ColumnMap(), layouts=own) if own else None
+    _inputs().append(path)
+    return replace(load_columns(path), layouts=own)
 
 
-_LAYOUTS, _INPUTS, _LOG = (f"{__name__}.{name}" for name in ("layouts", "inputs", "log"))
-LAYOUTS = eager_option(
+_INPUTS, _LOG = (f"{__name__}.{name}" for name in ("inputs", "log"))
+LAYOUTS = click.option(
     "--layouts",
     type=FOLDER,
     metavar="FOLDER",
-    callback=lambda ctx, option, folder: ctx.meta.update({_LAYOUTS: folder}),
+    is_eager=True,
     help="Folder of layouts (*.toml), by which text of further programs is read.",
 )
 _COLUMNS = click.option(
@@ -193,7 +196,6 @@ SECONDS_PER_LOG = click.option(
     "--seconds-per-log",
     type=Finite(0, 1e6, min_open=True),
     default=LOG_SECONDS,
-    show_default=True,
     metavar="S",
     help="Refuse a log whose identification takes more processor time than this.",
 )
@@ -204,6 +206,8 @@ ALLOW_FUTURE = click.option(
     callback=lambda ctx, option, given: LAST_MOMENT if given else None,
     help="Accept logs and maintenance that are dated after tomorrow.",
 )
+# By which logs are read.
+reading_options = combined(_COLUMNS, LAYOUTS, MOST_MEMORY, ALLOW_FUTURE)
 TODAY = click.option(
     "--today",
     type=day,
@@ -240,51 +244,43 @@ WORKERS = click.option(
     callback=lambda ctx, option, count: count or _processors(),
     help="Number of processes; default one per processor (in Python: 1).",
 )
-_SILENT_DAYS = click.option(
-    "--silent-days",
-    type=Finite(0, _MOST_DAYS, min_open=True),
-    metavar="N",
-    help="A machine is unknown after N days without a log; default five of its own intervals.",
-)
-_ALERT_COMMAND = click.option(
-    "--alert-command",
-    "command",
-    metavar="CMD",
-    callback=_words,
-    help="Run a program with the changes since the last run as JSON on standard input.",
-)
-_NOTIFY = click.option(
-    "--notify",
-    is_flag=True,
-    callback=_notify,
-    help=f"Send the changes to the addresses of apprise in {NOTIFY}.",
+# The fields of `Alerts`.
+alert_options = combined(
+    click.option(
+        "--silent-days",
+        type=Finite(0, _MOST_DAYS, min_open=True),
+        metavar="N",
+        help="A machine is unknown after N days without a log; default five of its own intervals.",
+    ),
+    click.option(
+        "--alert-command",
+        "command",
+        metavar="CMD",
+        callback=_words,
+        help="Run a program with the changes since the last run as JSON on standard input.",
+    ),
+    click.option(
+        "--notify",
+        is_flag=True,
+        callback=_notify,
+        help=f"Send the changes to the addresses of apprise in {NOTIFY}.",
+    ),
 )
 LANGUAGE = click.option(
     "--language",
     type=click.Choice(LANGUAGES),
     default="en",
-    show_default=True,
     help="Language of the pages; tables and messages are English.",
 )
 PDF = click.option("--pdf", is_flag=True, help="Also write the page of each stage as PDF.")
 
 
-def reading_options(command: Callable[..., Any]) -> Callable[..., Any]:
-    """Add the options by which logs are read: a map, layouts, memory in bytes, later dates."""
-    return _COLUMNS(LAYOUTS(MOST_MEMORY(ALLOW_FUTURE(command))))
-
-
-def alert_options(command: Callable[..., Any]) -> Callable[..., Any]:
-    """Add the fields of `Alerts`: --silent-days, --alert-command and --notify."""
-    return _SILENT_DAYS(_ALERT_COMMAND(_NOTIFY(command)))
-
-
-def format_option(*styles: str) -> Callable[[Any], Any]:
+def format_option(*styles: str) -> Decorator:
     """Return the option of the output format; the first is the default."""
     return click.option("--format", "style", type=click.Choice(styles), default=styles[0])
 
 
-def band_option(text: str) -> Callable[[Any], Any]:
+def band_option(text: str) -> Decorator:
     """Return the option of a frequency band."""
     return click.option(
         "--band",
@@ -297,25 +293,20 @@ def band_option(text: str) -> Callable[[Any], Any]:
     )
 
 
-def _log_to(ctx: click.Context, handler: logging.Handler) -> None:
-    handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(message)s"))
-    terminal.start_log(ctx, handler)
-
-
 def _verbose(ctx: click.Context, option: click.Parameter, given: bool) -> None:
     """Begin to log to standard error."""
     if given:
         handler = logging.StreamHandler()
         handler.addFilter(lambda record: not hasattr(record, "printed"))
-        _log_to(ctx, handler)
+        terminal.start_log(ctx, handler)
 
 
-_OUTPUT = (
+_OUTPUT = combined(
     eager_option(
-        *("-q", "--quiet"),
-        is_flag=True,
-        callback=lambda ctx, option, given: ctx.meta.update({terminal.__name__: given}),
-        help="Print results and errors only: no notes and no progress.",
+        "--log-file",
+        type=OUT,
+        callback=lambda ctx, option, path: ctx.meta.update({_LOG: path}),  # opened by `_Command`
+        help="Append events, notes and errors to a file.",
     ),
     eager_option(
         *("-v", "--verbose"),
@@ -324,16 +315,20 @@ _OUTPUT = (
         help="Print a line per event on standard error, with its time.",
     ),
     eager_option(
-        "--log-file",
-        type=OUT,
-        callback=lambda ctx, option, path: ctx.meta.update({_LOG: path}),  # opened by `_Command`
-        help="Append events, notes and errors to a file.",
+        *("-q", "--quiet"),
+        is_flag=True,
+        callback=lambda ctx, option, given: ctx.meta.update({terminal.__name__: given}),
+        help="Print results and errors only: no notes and no progress.",
     ),
 )
 
 
 class _Command(click.Command):
-    """A command that writes no file over one that it reads, and no two into one."""
+    """A command that returns its exit status, and writes no file over another of its files."""
+
+    def invoke(self, ctx: click.Context) -> None:
+        """Run the command; one that returns None is done."""
+        ctx.exit(super().invoke(ctx) or 0)
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
         """Require that each output is a file of its own, then begin the log in its file."""
@@ -367,7 +362,7 @@ class _Command(click.Command):
                     detail = f"{path} is also {name}; needed is another file"
                     raise click.BadParameter(detail, ctx, option)
         if log:
-            _log_to(ctx, logging.FileHandler(log, encoding="utf-8"))
+            terminal.start_log(ctx, logging.FileHandler(log, encoding="utf-8"))
 
 
 def command(*examples: str) -> Callable[[Callable[..., Any]], click.Command]:
@@ -375,4 +370,4 @@ def command(*examples: str) -> Callable[[Callable[..., Any]], click.Command]:
     # click does not wrap a paragraph that begins with a backspace.
     lines = ["\b", "Examples:", *(f"    lmshealth {example}" for example in examples)]
     made = click.command(cls=_Command, epilog="\n".join(lines))
-    return lambda function: made(reduce(lambda inner, option: option(inner), _OUTPUT, function))
+    return lambda function: made(_OUTPUT(function))

@@ -37,18 +37,13 @@ def stage(described: Stage, style: str) -> None:
         views.print_stage(content)
 
 
-def _detections(
-    ctx: click.Context, option: click.Parameter, values: tuple[str, ...]
-) -> list[tuple[str, float]]:
-    """Parse NAME=LOSS, without duplicates."""
-    found = dict[tuple[str, float], None]()
-    for value in values:
-        name, _, loss = value.partition("=")
-        try:
-            found[name, float(loss)] = None
-        except ValueError as error:
-            raise click.BadParameter(f"needs NAME=LOSS with a number, got {value!r}") from error
-    return list(found)
+def _detection(value: str) -> tuple[str, float]:
+    """Parse NAME=LOSS."""
+    name, _, loss = value.partition("=")
+    try:
+        return name, float(loss)
+    except ValueError as error:
+        raise click.BadParameter(f"needs NAME=LOSS with a number, got {value!r}") from error
 
 
 @options.command(
@@ -59,10 +54,11 @@ def _detections(
 @click.option(
     "--detect",
     "detections",
+    type=_detection,
     multiple=True,
     required=True,
     metavar="NAME=LOSS",
-    callback=_detections,
+    callback=options.unique,
     help="Parameter and the fraction of it that is lost; may be given several times.",
 )
 @click.option("--power", type=options.SHARE, default=0.95, help="Probability to detect the loss.")
@@ -76,14 +72,14 @@ def _detections(
     "--seconds",
     type=options.Finite(0, 1e9, min_open=True),
     multiple=True,
-    callback=lambda ctx, option, values: tuple(dict.fromkeys(values)),
+    callback=options.unique,
     help="Length of a log in s; may be given several times. Default 10 to 600 s.",
 )
 @options.format_option("table", "json")
 def plan(
     stage: Stage,
     detections: list[tuple[str, float]],
-    seconds: tuple[float, ...],
+    seconds: list[float],
     style: str,
     **given: Any,
 ) -> None:
@@ -144,10 +140,7 @@ def plan(
 @options.SEED
 @options.WORKERS
 @options.format_option("table", "json")
-@click.pass_context
 def check_calibration(
-    ctx: click.Context,
-    /,
     described: Stage,
     out: Path | None,
     lives: int,
@@ -155,7 +148,7 @@ def check_calibration(
     workers: int,
     style: str,
     **schedule: Any,
-) -> None:
+) -> int:
     """Check which coverage, detection and dates a stage description leads to.
 
     Lives are drawn from the description STAGE (its map, priors, laws, sensors), as modal estimates
@@ -197,4 +190,5 @@ def check_calibration(
         raise interrupted
     if page.verdict_of(found)[0] == "bad":
         terminal.print_errors([f"{found.stage}: {len(found.wrong)} checks are not as stated"])
-        ctx.exit(1)
+        return 1
+    return 0

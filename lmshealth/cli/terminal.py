@@ -17,11 +17,11 @@ import sys
 import time
 import unicodedata
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from textwrap import wrap
-from typing import Any, TextIO
+from typing import Any, TextIO, TypeVar
 
 import click
 import msgspec
@@ -147,6 +147,9 @@ PATIENCE = 2.0  # seconds without a progress bar
 _NAME, _SHORT = 16, 10
 
 
+Item = TypeVar("Item")
+Report = Callable[[str, int, int], None]
+
 _logger = logging.getLogger(__name__)
 _PRINTED = {"printed": True}  # records that are on the terminal already
 
@@ -159,6 +162,7 @@ def quiet() -> bool:
 
 def start_log(context: click.Context, handler: logging.Handler) -> None:
     """Send records of the package to a handler until the program ends, which prints its error."""
+    handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(message)s"))
     context = context.find_root()  # that of a command ends before, or not at all for a bad option
     logger = logging.getLogger("lmshealth")
     logger.setLevel(logging.INFO)
@@ -364,3 +368,11 @@ def progress_bars(delay: float = 0.0) -> Iterator[Any]:
             bars.update(tasks[what], completed=done, total=total)
 
         yield report
+
+
+def counted(report: Report, what: str, items: Sequence[Item]) -> Iterator[Item]:
+    """Yield items, and report before each, and at the end, how many of them are done."""
+    for done, item in enumerate(items):
+        report(what, done, len(items))
+        yield item
+    report(what, len(items), len(items))

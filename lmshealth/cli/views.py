@@ -6,7 +6,7 @@ import math
 from bisect import bisect_right
 from collections.abc import Iterator, Sequence
 from datetime import date
-from itertools import combinations, permutations, zip_longest
+from itertools import combinations, zip_longest
 from typing import TYPE_CHECKING
 
 from lmshealth._private.arrays import FloatArray
@@ -80,22 +80,18 @@ def print_shapes(rows: Sequence[Row], pairs: Sequence[Row]) -> None:
                 shapes.append(row | {"channel": channel, "size": amplitude, "phase": round(phase)})
     if shapes:
         print_view("Mode shapes (accelerations relative to the largest)", "shapes", shapes)
-    mac = {
-        (pair["log"], *modes): pair["mac"]
-        for pair in pairs
-        for modes in permutations((pair["mode_a"], pair["mode_b"]))
-    }
+    mac = {(one["log"], frozenset((one["mode_a"], one["mode_b"]))): one["mac"] for one in pairs}
     title = "Phase collinearity (MPC) and modal assurance criterion (MAC)"
     for log in dict.fromkeys(row["log"] for row in rows):
         own = [row for row in rows if row["log"] == log]
         names = [row["mode"] for row in own]
         for first in range(0, len(own), _MATRIX):
-            matrix = []
-            for row in own:
-                cell = {"log": log, "mode": row["mode"], "MPC": _criterion(row["mpc"])}
-                for name in names[first : first + _MATRIX]:
-                    cell[name] = _criterion(mac.get((log, row["mode"], name), 1.0))
-                matrix.append(cell)
+            shown = names[first : first + _MATRIX]
+            matrix = [
+                {"log": log, "mode": row["mode"], "MPC": _criterion(row["mpc"])}
+                | {n: _criterion(mac.get((log, frozenset((row["mode"], n))), 1.0)) for n in shown}
+                for row in own
+            ]
             print_table(title, matrix, 2)
 
 
@@ -344,8 +340,6 @@ def print_track(track: Track) -> None:
 def print_health(health: Health) -> None:
     """Print the health parameters at the last epoch with their diagnostics, and what limits use."""
     rows = to_rows(health.to_columns())[-len(health.parameters) :]
-    for row in rows:
-        row["interval"] = "{q05:.3f} to {q95:.3f}".format(**row)
     when, n_epochs = text.day(health.recorded_at[-1]), len(health.recorded_at)
     title = f"{health.stage}: health at {when}, the last of {n_epochs} epochs"
     print_view(title, "health", rows)
@@ -360,18 +354,14 @@ def print_health(health: Health) -> None:
             "no health is reported. Check for other causes of the drifts and errors of the map."
         )
     for row, publishable in zip(rows, health.publishable_parameters(), strict=True):
-        for doubt in _doubts(row, determined=publishable or not health.explained):
-            print_text(f"{row['parameter']}: {doubt}")
-
-
-def _doubts(row: Row, *, determined: bool) -> Iterator[str]:
-    """Yield what limits the use of the posterior of a parameter."""
-    if row["at_edge"]:
-        yield "the posterior ends at the edge of the map; this is a bound. Extend the map."
-    if not row["identifiable"]:
-        yield "not identifiable from the tracked modes; see `lmshealth stage`."
-    elif not determined:
-        yield "not determined by these drifts."
+        name = row["parameter"]
+        if row["at_edge"]:
+            edge = "the posterior ends at the edge of the map; this is a bound. Extend the map."
+            print_text(f"{name}: {edge}")
+        if not row["identifiable"]:
+            print_text(f"{name}: not identifiable from the tracked modes; see `lmshealth stage`.")
+        elif health.explained and not publishable:
+            print_text(f"{name}: not determined by these drifts.")
 
 
 # Steps whose sentence is about what is only on the page.
@@ -457,12 +447,13 @@ def print_life(
                 begin = f" from {text.km(law.begin)} after the baseline" if law.begin else ""
                 laws.append(f"{law.kind}{begin} {text.probability(law.probability)}")
         print_text(f"Law of {spell(name)}: {', '.join(laws)}.")
-    if life.undetermined:
-        names = ", ".join(map(spell, life.undetermined))
-        print_text(f"Not included: the limit of {names}, which the modes cannot determine.")
-    if life.restored:
-        names = ", ".join(map(spell, life.restored))
-        print_text(f"Not included: the limit of {names}, which later work has restored.")
+    for left_out, why in (
+        (life.undetermined, "the modes cannot determine"),
+        (life.restored, "later work has restored"),
+    ):
+        if left_out:
+            names = ", ".join(map(spell, left_out))
+            print_text(f"Not included: the limit of {names}, which {why}.")
     for sentence in _advice(life, service, when, today):
         print_text(sentence)
     print_line("")
