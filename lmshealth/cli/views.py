@@ -340,6 +340,8 @@ def print_track(track: Track) -> None:
 def print_health(health: Health) -> None:
     """Print the health parameters at the last epoch with their diagnostics, and what limits use."""
     rows = to_rows(health.to_columns())[-len(health.parameters) :]
+    for row in rows:
+        row["interval"] = "{q05:.3f} to {q95:.3f}".format(**row)
     when, n_epochs = text.day(health.recorded_at[-1]), len(health.recorded_at)
     title = f"{health.stage}: health at {when}, the last of {n_epochs} epochs"
     print_view(title, "health", rows)
