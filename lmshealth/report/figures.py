@@ -664,8 +664,9 @@ def plot_waterfall(
     ax.set_ylim(waterfall.edges[0], waterfall.edges[-1])
     if waterfall.edges[-1] > _WIDE * waterfall.edges[0]:
         ax.set_yscale("log")
-    for k in range(len(track.modes) if track else 0):
-        _on_image(ax, track, k, 0.0 if moved is None else moved[:, k])
+    if track is not None:
+        for k in range(len(track.modes)):
+            _on_image(ax, track, k, 0.0 if moved is None else moved[:, k])
     ax.set_ylabel(tr("frequency in Hz"))
     return odometer(ax, history, room=36)  # next to the colour bar
 

@@ -254,7 +254,6 @@ def _plots(
 ) -> Iterator[tuple[tuple[str, ...], Any]]:
     """Yield what draws each picture of the machine's life, after its key on the page."""
     history, track, waterfall = assessment.history, assessment.track, assessment.waterfall
-    health, prognosis = assessment.latest_health, content["prognosis"]
     specs = {spec.name: spec for spec in assessment.stage.parameters}
     lives: dict[str, Any] = {"history": history, "track": track}
     for mode in content["seen"]:
@@ -268,16 +267,17 @@ def _plots(
         yield ("influence", one.covariate, one.mode), plot
     if track and content["nis"]:
         yield ("nis", "all"), partial(figures.plot_nis, track=track)
-    for names, title, _ in content["pairs"]:
-        plot = partial(figures.plot_posterior, health=health, parameters=names)
-        yield ("posterior", title), plot
-    for name in health.parameters if health else ():
-        plot = partial(figures.plot_health, health=health, limit=limit_of(specs[name]))
-        yield ("health", name), partial(plot, parameter=name)
-    for name in prognosis.parameters[:-1] if prognosis else ():
-        plot = partial(figures.plot_life, prognosis=prognosis, baseline=specs[name].baseline)
-        yield ("life", name), partial(plot, parameter=name)
-    if prognosis:
+    if (health := assessment.latest_health) is not None:
+        for names, title, _ in content["pairs"]:
+            plot = partial(figures.plot_posterior, health=health, parameters=names)
+            yield ("posterior", title), plot
+        for name in health.parameters:
+            plot = partial(figures.plot_health, health=health, limit=limit_of(specs[name]))
+            yield ("health", name), partial(plot, parameter=name)
+    if (prognosis := content["prognosis"]) is not None:
+        for name in prognosis.parameters[:-1]:
+            plot = partial(figures.plot_life, prognosis=prognosis, baseline=specs[name].baseline)
+            yield ("life", name), partial(plot, parameter=name)
         plot = partial(figures.plot_survival, prognosis=prognosis, service=service)
         yield ("survival", "any"), plot
 
