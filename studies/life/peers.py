@@ -34,7 +34,7 @@ from lmshealth.calibration.ranks import clopper_pearson
 from studies.harness.claims import Claim, number
 from studies.harness.metrics import crps, mean
 from studies.harness.study import Row, Study
-from studies.life.kinds.answers import IMPORTANCE, answer
+from studies.life.kinds.answers import answer
 from studies.life.kinds.plant import LIMITS, MODES, Array, drift, map_table
 from studies.life.kinds.worlds import LIFE_KM, MAP_ERROR, REFERENCE_C, Life, life_of
 
@@ -62,7 +62,7 @@ def main() -> None:
 
 def by_lmshealth(kind: str, k: int) -> Row:
     """Assess a life, and return draws of ln preload now and of the travel left in km."""
-    found = answer(life_of(kind, k).logs(), map_table(), k, IMPORTANCE)
+    found = answer(life_of(kind, k).logs(), map_table(), k)
     health = found["health"].get("guide_preload")
     return {"health": health, "left": found["left_km"], "cpu_s": found["cpu_s"]}
 

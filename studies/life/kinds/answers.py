@@ -1,21 +1,13 @@
-"""Answers of `lmshealth` to lives of the plant, through its published functions alone.
-
-As a program it answers lives from stdin, one JSON object a line, with the code that ``PYTHONPATH``
-names: an earlier revision as well as this one. It therefore imports nothing of the studies.
-"""
+"""Answers of `lmshealth` to lives of the plant: by importance sampling, as after a new log."""
 
 from __future__ import annotations
 
-import json
 import re
-import sys
 import tempfile
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from datetime import datetime
 from functools import cache, partial
-from importlib import import_module, resources
+from importlib import resources
 from pathlib import Path
 from typing import Any
 from unittest.mock import patch
@@ -24,13 +16,11 @@ import numpy as np
 
 import lmshealth
 from lmshealth.io.log import Metadata
+from lmshealth.life.posterior.fit import fit_life
 from lmshealth.modal.modes import Modes
+from lmshealth.tracking.maintenance import Action, Maintenance
 
 Answer = dict[str, Any]
-# How a life is assessed: with the chains that are published; by importance sampling, as after a log
-# that only updates a life; or, by the earlier revision alone, in a shorter way.
-PUBLISHED, IMPORTANCE = "as published", "by importance sampling"
-WITHOUT_CHAINS, HEALTH_ALONE = "life without chains", "health alone"
 _LEVELS = (np.arange(101) + 0.5) / 101  # of the quantiles that stand for draws
 _SHIPPED, _COMMON = "lms-y.map.csv", re.compile(r"^common_std.*\n", re.MULTILINE)
 _NEVER_KM = 1e6  # for a limit that is never reached
@@ -71,12 +61,14 @@ def readings_of(logs: Answer) -> list[lmshealth.LogEstimates]:
     return found
 
 
-def answer(logs: Answer, map_table: str, seed: int, how: str = PUBLISHED) -> Answer:
+def answer(logs: Answer, map_table: str, seed: int) -> Answer:
     """Assess a life: verdict, draws of ln health now and of the travel left, service."""
-    start = time.process_time()
-    with _shortened(how) as options:
-        if logs["work"][0]:
-            options |= {"work": _maintenance(*logs["work"])}
+    start, (action, moment) = time.process_time(), logs["work"]
+    options: Answer = {"epochs": 1}
+    if action:
+        work = Maintenance((Action("AX-1", datetime.fromisoformat(moment), action),))
+        options["work"] = work
+    with patch("lmshealth.machine.assessment.fit_life", partial(fit_life, chains=False)):
         made = lmshealth.assess(readings_of(logs), stage_of(map_table), seed=seed, **options)
     service, judged = made.service(), made.judgement
     found: Answer = {
@@ -94,47 +86,9 @@ def answer(logs: Answer, map_table: str, seed: int, how: str = PUBLISHED) -> Ans
     return found | {"cpu_s": round(time.process_time() - start, 2)}
 
 
-def _maintenance(action: str, moment: str) -> Any:
-    module: Any = import_module("lmshealth.tracking.maintenance")
-    return module.Maintenance((module.Action("AX-1", datetime.fromisoformat(moment), action),))
-
-
-@contextmanager
-def _shortened(how: str) -> Iterator[Answer]:
-    """Shorten the assessment of the earlier revision: one epoch, and a life without chains."""
-    if how == PUBLISHED:
-        yield {}
-        return
-    if how == IMPORTANCE:
-        module: Any = import_module("lmshealth.machine.assessment")
-        fit = module.fit_life
-        with patch.object(module, "fit_life", lambda *a, **k: fit(*a, **(k | {"chains": False}))):
-            yield {"epochs": 1}
-        return
-    module = import_module("lmshealth.batch.assess")  # its place in that revision
-    name = "prognose_with_posterior"
-
-    def no_life(*_: Any, **__: Any) -> None:
-        raise lmshealth.LmshealthError("no life is asked for")
-
-    short = no_life if how == HEALTH_ALONE else partial(getattr(module, name), chains=False)
-    with patch.object(module, name, short):
-        yield {"epochs": 1}
-
-
 def _quantiles(draws: Any) -> list[float]:
     return [round(v, 5) for v in np.quantile(draws, _LEVELS, method="inverted_cdf").tolist()]
 
 
 def _number(value: float) -> float | None:
     return float(value) if np.isfinite(value) else None
-
-
-def main() -> None:
-    """Answer lives until the end of stdin."""
-    for line in sys.stdin:
-        print(json.dumps(answer(**json.loads(line))), flush=True)
-
-
-if __name__ == "__main__":
-    main()

@@ -25,9 +25,12 @@ _UNLIKELY = 1e-6  # density over its maximum beyond which the fine grid ends
 
 
 def marginals(life: Life) -> dict[str, tuple[Array, Array]]:
-    """Return grid and probabilities of ln health now of each parameter that has changed."""
+    """Return grid and probabilities of ln health now of each parameter that has changed.
+
+    None after work: what a parameter lost before it and since are two unknowns.
+    """
     moving = [j for j in range(len(PARAMETERS)) if life.size[j] and life.course[-1, j]]
-    if not moving:
+    if not moving or life.world.work:
         return {}
     limits = [(-1.2, -1e-4) if life.size[j] > 0 else (1e-4, 0.6) for j in moving]
     axes = [np.linspace(*ends, _COARSE[len(moving)]) for ends in limits]

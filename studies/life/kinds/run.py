@@ -10,8 +10,7 @@ Method
     the preload that the description has (hertz) and has not, a mount that loosens, both, a mount
     that settles stiffer while the preload wears ("opposite"), one mode that moves by another cause,
     steps, work that restores the other part, a usage that doubles, a wander that all modes have in
-    common, and machines that stay as they are. `lmshealth.assess` answers, with the chains that it
-    publishes.
+    common, and machines that stay as they are. `lmshealth.assess` answers, by importance sampling.
     Each kind is judged by itself: a share over lives that wear and lives that do not hides both.
     Places of the truth among draws, ties at random, give the shares of 90 and 50 % intervals that
     hold; widths are compared with those of a posterior that knows the shape of every course, all
@@ -19,43 +18,33 @@ Method
     cannot hold 90 % where the map is twice as wrong, and need not be surpassed there. A verdict
     counts where no loss is within 5 % of the share at which it counts as degraded; of a lone mode
     it must name the mode. A row passes if the 95 % interval of its figure reaches what is required;
-    all courses of the preload together must meet it. Control, which must fail: the same lives,
-    fewer of them, by the code that had a posterior of its own at each epoch: its health alone, and
-    with the prognosis, without its chains, for lives that wear and are seen up to 90 %.
+    all courses of the preload together must meet it. After work there is no such posterior, and
+    no width is compared. Controls, which must fail: intervals of 0.8 of the width, and what is
+    required of machines that stay, of lives that wear.
 Run time
     An hour of one processor. ``--kinds`` does those whose names contain one of some words
-    (``late;opposite``), ``--lives`` so many of each, ``--earlier`` by the code of the control.
+    (``late;opposite``), ``--lives`` so many of each.
 """
 
 from __future__ import annotations
 
-import hashlib
-import json
-from collections.abc import Iterator, Mapping, Sequence
-from functools import partial
-from pathlib import Path
-from typing import Any
+from collections.abc import Iterator, Mapping
 
 from studies.harness.claims import Claim, counted, number
-from studies.harness.program import Program
-from studies.harness.provenance import code_of
-from studies.harness.study import Row, Study, record_of
-from studies.life.kinds.answers import HEALTH_ALONE, IMPORTANCE, WITHOUT_CHAINS, answer
+from studies.harness.study import Row, Study
+from studies.life.kinds.answers import answer
 from studies.life.kinds.plant import PARAMETERS, map_table
-from studies.life.kinds.scores import scored, summarised
+from studies.life.kinds.scores import NARROW, scored, summarised
 from studies.life.kinds.worlds import (
     HEALTHY,
     LONE,
     MAP_ERROR,
     SEED,
-    SHARES,
     WEARING,
     WORLDS,
     life_of,
 )
 
-# The last revision with a posterior of its own at each epoch.
-REVISION = "1811c297"
 # Lives of each kind: rows that the requirements name have a hundred or more.
 LIVES = {
     **dict.fromkeys(WEARING, 36), **dict.fromkeys(LONE, 34), **dict.fromkeys(HEALTHY, 34),
@@ -63,13 +52,7 @@ LIVES = {
 }  # fmt: skip
 FEW, QUICK_LIVES, QUICK = 30, 2, ("preload, late", "yaw alone, 2 %")
 ALL = "preload, all courses"
-# Lives of the control. Whoever changes them, or `by_row`, deletes the key ``control`` of the
-# record: the digest that `of_control` compares does not have them.
-EARLIER = {
-    **dict.fromkeys(WEARING, 12), **dict.fromkeys(LONE, 8), **dict.fromkeys(HEALTHY, 16),
-    "mount, loosening": 100, "opposite": 32,
-    "preload, linear, short logs": 40, "mount, loosening, short logs": 40,
-}  # fmt: skip
+STAYS = "healthy", "no-alarm"  # verdicts of machines that stay
 # Required: shares of intervals that hold, bias of ln, width over the ideal; of a lone mode named,
 # of opposite changes held; most alarms and most held of machines that stay; remaining life held,
 # its width over the truth at 90 % of life, services too late.
@@ -111,81 +94,29 @@ OF_LIFE = ("remaining life is held", "services are in time", "remaining life is 
 
 def main() -> None:
     """Run the study; ``--quick`` does two lives of two kinds and records nothing."""
-    study = Study(__file__, __doc__, kinds="", lives=0, earlier=False)
+    study = Study(__file__, __doc__, kinds="", lives=0)
     chosen, words = study.options, study.options.kinds.split(";")
     plan = {kind: chosen.lives or LIVES.get(kind, FEW) for kind in WORLDS
             if any(word in kind for word in words)}  # fmt: skip
     if study.quick:
         plan = dict.fromkeys(QUICK, QUICK_LIVES)
-    part = bool(chosen.kinds or chosen.earlier)
-    rows = earlier(study, plan) if chosen.earlier else now(study, plan)
-    before, code = ({}, "") if study.quick or part else of_control(study)
-    answered: Row = {"seed": SEED, "kinds": by_row(rows), "earlier": before, "control": code}
+    # The first lives of each kind first.
+    tasks = [(kind, k) for k in range(max(plan.values())) for kind, n in plan.items() if k < n]
+    rows: dict[str, list[Row]] = {kind: [] for kind in plan}
+    for (kind, k), own in zip(tasks, study.trials.collect(one, tasks), strict=True):
+        rows[kind].append(scored(kind, k, own))
+    answered: Row = {"seed": SEED, "kinds": by_row(rows)}
     answered["passed"] = verdicts(answered)
-    if part:
+    if chosen.kinds:
         for claim in claims(answered):
             print(" | ".join((claim.what, claim.figure, claim.interval, claim.beside)))
         return
     study.conclude(answered, not_met=NOT_MET, quick_may_fail=True)
 
 
-def one(kind: str, number_: int, how: str = IMPORTANCE) -> Row:
-    """Answer one life by the code that is imported."""
-    return answer(life_of(kind, number_).logs(), map_table(), number_, how)
-
-
-def one_before(program: Program, kind: str, number_: int, how: str) -> Any:
-    """Answer one life by the code of the control."""
-    logs = life_of(kind, number_).logs()
-    return program.ask({"logs": logs, "map_table": map_table(), "seed": number_, "how": how})
-
-
-def now(study: Study, plan: Mapping[str, int]) -> dict[str, list[Row]]:
-    """Answer and score lives of some kinds."""
-    tasks = _tasks(plan)
-    found = study.trials.collect(one, tasks)
-    return _scored(tasks, found)
-
-
-def of_control(study: Study) -> tuple[Mapping[str, Any], str]:
-    """Summarise the answers of the control; return also the digest of the code that gives them.
-
-    That code is of a fixed revision: while the lives and the scores are the same, answers that are
-    recorded are not computed again.
-    """
-    answers = hashlib.sha256(Path(__file__).with_name("answers.py").read_bytes()).hexdigest()
-    code, path = f"{code_of(earlier)} {answers[:16]}", record_of(__file__)
-    known = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
-    if known.get("control") == code:
-        return known["earlier"], code
-    return by_row(earlier(study, EARLIER)), code
-
-
-def earlier(study: Study, plan: Mapping[str, int]) -> dict[str, list[Row]]:
-    """Answer and score the same lives by the code of the control."""
-    tasks = _tasks(plan)
-    old = SHARES.index(max(SHARES))
-    how = [
-        WITHOUT_CHAINS if kind in WEARING and k % len(SHARES) == old else HEALTH_ALONE
-        for kind, k in tasks
-    ]
-    with Program(Path(__file__).with_name("answers.py"), REVISION) as program:
-        own = [(*task, way) for task, way in zip(tasks, how, strict=True)]
-        found = study.trials.collect(partial(one_before, program), own)
-    return _scored(tasks, found)
-
-
-def _tasks(plan: Mapping[str, int]) -> list[tuple[str, int]]:
-    """Return all lives, the first ones of each kind first."""
-    most = max(plan.values())
-    return [(kind, k) for k in range(most) for kind, n in plan.items() if k < n]
-
-
-def _scored(tasks: Sequence[tuple[str, int]], found: Sequence[Row]) -> dict[str, list[Row]]:
-    rows: dict[str, list[Row]] = {kind: [] for kind, _ in tasks}
-    for (kind, k), own in zip(tasks, found, strict=True):
-        rows[kind].append(scored(kind, k, own))
-    return rows
+def one(kind: str, number_: int) -> Row:
+    """Answer one life."""
+    return answer(life_of(kind, number_).logs(), map_table(), number_)
 
 
 def by_row(rows: Mapping[str, list[Row]]) -> dict[str, Row]:
@@ -203,19 +134,24 @@ def moving(kind: str) -> list[str]:
 
 
 def verdicts(answered: Row) -> dict[str, bool]:
-    """Return what was asked of every kind, and that the control fails."""
-    kinds, before = answered["kinds"], answered["earlier"]
-    checks: dict[str, bool] = {}
-    for kind, row in kinds.items():
-        checks |= {f"{kind}: {what}": fine for what, fine in _asked(kind, row)}
-    if before:
-        own = _asked(ALL, before[ALL])
-        checks["health by the code before is wrong (control)"] = not all(
-            fine for what, fine in own if what.startswith("guide_preload")
+    """Return what was asked of every kind, and that the controls fail."""
+    kinds = answered["kinds"]
+    checks = {f"{kind}: {what}": fine
+              for kind, row in kinds.items() for what, fine in _asked(kind, row)}  # fmt: skip
+    if ALL in kinds:
+        narrow = kinds[ALL]["health"]["guide_preload"]["held_90_narrow"]
+        checks["narrow intervals hold too seldom (control)"] = not _within(narrow, HELD_90, 0.0)
+        checks["wear is not taken for a machine that stays (control)"] = not _stays(kinds[ALL])
+        checks["parts that wear are surely degraded (control)"] = (
+            kinds[ALL]["surely_degraded"]["hits"] > 0
         )
-        named = [before[kind]["right"]["high"] for kind in LONE]
-        checks["lone modes are not named by the code before (control)"] = max(named) < NAMED
     return checks
+
+
+def _stays(row: Row) -> bool:
+    """Return whether as few lives of a row have another verdict as machines that stay may have."""
+    quiet = sum(row["verdicts"].get(word, 0) for word in STAYS)
+    return bool(quiet >= (1 - ALARMS) * row["n"])
 
 
 def _asked(kind: str, row: Row) -> Iterator[tuple[str, bool]]:
@@ -238,7 +174,7 @@ def _asked(kind: str, row: Row) -> Iterator[tuple[str, bool]]:
         yield f"{name} is held", held
         mean, error = own["bias"]
         yield f"{name} has no bias", abs(mean) <= BIAS + 2 * loose * error
-        yield f"{name} is narrow", own["width_over_ideal"] <= WIDTH
+        yield f"{name} is narrow", (own["width_over_ideal"] or 0.0) <= WIDTH
     if kind in LONE:
         yield "the mode is named", row["right"]["high"] >= NAMED
         yield "no part is surely degraded", row["surely_degraded"]["hits"] == 0
@@ -261,39 +197,32 @@ def _within(share: Row, ends: tuple[float, float], loose: float) -> bool:
 
 def claims(answered: Row) -> Iterator[Claim]:
     """Claim coverage, bias and width of every kind, verdicts, and remaining lives."""
-    before, passed = answered["earlier"], answered["passed"]
+    passed = answered["passed"]
     for kind, row in answered["kinds"].items():
-        was: Row = before.get(kind, {"health": {}, "right": None, "left_90": None})
 
         def fine(*whats: str, kind: str = kind) -> bool:
             return all(passed.get(f"{kind}: {what}", True) for what in whats)
 
         names = list(row["health"]) if kind in HEALTHY else moving(kind)
         for name in (name for name in names if name in row["health"]):
-            own, old = row["health"][name], was["health"].get(name)
+            own = row["health"][name]
             yield counted(
                 f"90 % intervals hold: {kind}, {name.replace('_', ' ')}",
                 own["held_90"]["hits"],
                 own["n"],
-                _beside(own)
-                + (f"; code before {_share(old['held_90'])}, {_beside(old)}" if old else ""),
+                _beside(own),
                 met=fine(*(f"{name} {what}" for what in OF_HEALTH)),
             )
         if right := row["right"]:
             counts = ", ".join(f"{word} {n}" for word, n in sorted(row["verdicts"].items()))
             beside = (f"{number(row['expected'])} by their probabilities; {_sure(row)}; "
                       f"all: {counts}")  # fmt: skip
-            if old_right := was["right"]:
-                beside += f"; code before: {_share(old_right)} right, {_sure(was)}"
             what, n = f"verdicts that are right: {kind}", right["n"]
             yield counted(what, right["hits"], n, beside, met=fine(*OF_VERDICTS))
         if left := row["left_90"]:
             width = "none" if row["left_width"] is None else number(row["left_width"])
             beside = f"median width over the truth at 90 % of life {width}; "
             beside += f"services too late {row['late']['hits']}"
-            if old_left := was["left_90"]:
-                beside += f"; code before {_share(old_left)}, {number(was['left_width'])}, "
-                beside += f"{was['late']['hits']} late"
             yield counted(f"90 % intervals of the remaining life hold: {kind}", left["hits"],
                           left["n"], beside, met=fine(*OF_LIFE))  # fmt: skip
 
@@ -315,7 +244,7 @@ def _beside(own: Row) -> str:
     text += number(own["rms"])
     if ratio:
         text += f", width {ratio:.2f} of the ideal, which holds {_share(best)}"
-    return text
+    return f"{text}; {NARROW} of the width: {_share(own['held_90_narrow'])}"
 
 
 if __name__ == "__main__":

@@ -16,6 +16,7 @@ from studies.life.kinds.plant import MODES, PARAMETERS
 from studies.life.kinds.worlds import SEED, SHARES, Life, life_of
 
 LEVEL, SURE, SOON_DAYS = 0.95, 0.9, 90.0
+NARROW = 0.8  # of the width of intervals, as a control
 _DEGRADED = ("preload", "mount", "both")
 
 
@@ -49,11 +50,15 @@ def scored(kind: str, number: int, answer: Row) -> Row:
 
 
 def _health(draws: Any, truth: float, rng: np.random.Generator) -> Row:
-    """Place the truth among draws, ties at random: a parameter that surely stays is one value."""
+    """Place the truth among draws, ties at random: a parameter that surely stays is one value.
+
+    "narrow" is its place among draws that are nearer to their median, as a control.
+    """
     low, middle, high = np.quantile(draws, [0.05, 0.5, 0.95])
     # As draws are rounded.
     at = float(rank_of(draws[:, None], np.array([round(truth, 5)]), rng)[0])
-    return {"place": at, "off": float(middle - truth), "width": float(high - low)}
+    narrow = float(np.mean(middle + NARROW * (draws - middle) < truth))
+    return {"place": at, "off": float(middle - truth), "width": float(high - low), "narrow": narrow}
 
 
 def _wait(service: Sequence[Any]) -> float | None:
@@ -94,7 +99,8 @@ def summarised(rows: Sequence[Row]) -> Row:
 def _summed(rows: Sequence[Row], name: str) -> Row:
     """Summarise what is published of a parameter."""
     own = [row["health"][name] for row in rows]
-    places, off, width = (np.array([one[key] for one in own]) for key in ("place", "off", "width"))
+    keys = "place", "off", "width", "narrow"
+    places, off, width, narrow = (np.array([one[key] for one in own]) for key in keys)
     best = [row["ideal"].get(name) for row in rows]
     ratio = [w / one["width"] for w, one in zip(width, best, strict=True) if one]
     held = [abs(one["place"] - 0.5) < 0.45 for one in best if one]
@@ -102,6 +108,7 @@ def _summed(rows: Sequence[Row], name: str) -> Row:
         "n": len(own),
         "held_90": _share(np.abs(places - 0.5) < 0.45),
         "held_50": _share(np.abs(places - 0.5) < 0.25),
+        "held_90_narrow": _share(np.abs(narrow - 0.5) < 0.45),
         "bias": [float(off.mean()), float(off.std() / np.sqrt(len(off)))],
         "rms": float(np.sqrt(np.mean(off**2))),
         "width": float(np.median(width)),
