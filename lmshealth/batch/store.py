@@ -11,7 +11,7 @@ import hashlib
 import logging
 import time
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -189,8 +189,9 @@ class Store:
         with self._faults():
             tables = sql.inspect(self._engine).get_table_names()
         if VALUES.name not in tables:
-            older = "only results of another version of lmshealth"
-            found = older if database.is_older(tables) else "no results"
+            found = "no results"
+            if database.is_older(tables):
+                found = "only results of another version of lmshealth"
             self.close()
             raise self.unfilled(f"{found} (no table {VALUES.name})")
 
@@ -410,7 +411,8 @@ class Store:
             rows = connection.execute(query).all()
         found = list[tuple[str, bytes]]()
         for owner, key, stored in rows:
-            if (content := _unsealed(stored, kind, owner, key)) is not None:
+            content = _unsealed(stored, kind, owner, key)
+            if content is not None:
                 found.append((key, content))
                 continue
             self.damaged[kind] += 1
@@ -506,8 +508,9 @@ def _unsealed(stored: Any, *place: Any) -> bytes | None:
 
 def _seal(content: bytes, *place: Any) -> bytes:
     subject = "\0".join(map(str, place)).encode("utf-8", "surrogatepass")
-    key = hashlib.sha256(subject).digest()
-    return hashlib.blake2b(content, digest_size=_SEAL_BYTES, key=key).digest()
+    return hashlib.blake2b(
+        content, digest_size=_SEAL_BYTES, key=hashlib.sha256(subject).digest()
+    ).digest()
 
 
 # Cached functions
@@ -548,23 +551,35 @@ def cached(
     """
     store = resources.store
 
-    def jobs(left: Sequence[Piece], claimed: dict[int, list[Piece]]) -> Iterator[Any]:
-        """Yield jobs of the pieces that this run can claim; ``claimed`` has these by a job's id."""
+    def compute(
+        pieces: Sequence[Piece],
+    ) -> Generator[tuple[Pairs[Piece, Value], bool], None, list[Piece]]:
+        """Compute the values of unclaimed pieces; return the other pieces."""
+        others, claimed = list[Piece](), dict[int, list[Piece]]()
         # A few are spread over the workers.
-        size = min(most, max(1, len(left) // (4 * resources.pool.size)))
-        for first in range(0, len(left), size):
-            part = {key(piece): piece for piece in left[first : first + size]}
-            own = store.claim([*part])
-            if store.is_divided:  # another run may have done it since this one began
-                done = {key(piece) for piece, _ in fetch([part[one] for one in part if one in own])}
-                store.release([*done])
-                own -= done
-            if mine := [piece for one, piece in part.items() if one in own]:
-                made = job(mine)
-                claimed[id(made)] = mine
-                yield made
+        size = min(most, max(1, len(pieces) // (4 * resources.pool.size)))
 
-    left, is_waiting = [*pieces], False
+        def jobs() -> Iterator[Any]:
+            for first in range(0, len(pieces), size):
+                part = [(key(piece), piece) for piece in pieces[first : first + size]]
+                own = store.claim([one for one, _ in part])
+                if store.is_divided:  # another run may have done it since this one began
+                    done = {key(piece) for piece, _ in fetch([p for k, p in part if k in own])}
+                    store.release([*done])
+                    own -= done
+                others.extend(piece for one, piece in part if one not in own)
+                if mine := [piece for one, piece in part if one in own]:
+                    made = job(mine)
+                    claimed[id(made)] = mine
+                    yield made
+
+        for made, values in resources.pool.map_unordered(function, jobs(), on_crash):
+            mine = claimed.pop(id(made))
+            yield list(zip(mine, values, strict=True)), True
+            store.release([key(piece) for piece in mine])
+        return others
+
+    left, is_waiting = pieces, False
     while left:
         known = set[str]()
         for piece, value in fetch(left):
@@ -573,12 +588,5 @@ def cached(
         if is_waiting and not known:
             time.sleep(constants.OTHERS_POLL_S)
         left = [piece for piece in left if key(piece) not in known]
-        claimed, computed = dict[int, list[Piece]](), set[str]()
-        for made, values in resources.pool.map_unordered(function, jobs(left, claimed), on_crash):
-            mine = claimed.pop(id(made))
-            yield list(zip(mine, values, strict=True)), True
-            own = [key(piece) for piece in mine]
-            store.release(own)
-            computed.update(own)
-        is_waiting = not computed
-        left = [piece for piece in left if key(piece) not in computed]
+        others = yield from compute(left)
+        left, is_waiting = others, len(others) == len(left)
