@@ -6,7 +6,7 @@ import re
 import tempfile
 import time
 from datetime import datetime
-from functools import cache, partial
+from functools import cache
 from importlib import resources
 from pathlib import Path
 from typing import Any
@@ -16,7 +16,7 @@ import numpy as np
 
 import lmshealth
 from lmshealth.io.log import Metadata
-from lmshealth.life.posterior.fit import fit_life
+from lmshealth.life.posterior.fit import LifePosterior, fit_life
 from lmshealth.modal.modes import Modes
 from lmshealth.tracking.maintenance import Action, Maintenance
 
@@ -68,7 +68,11 @@ def answer(logs: Answer, map_table: str, seed: int) -> Answer:
     if action:
         work = Maintenance((Action("AX-1", datetime.fromisoformat(moment), action),))
         options["work"] = work
-    with patch("lmshealth.machine.assessment.fit_life", partial(fit_life, chains=False)):
+
+    def without_chains(*given: Any, **settings: Any) -> LifePosterior:
+        return fit_life(*given, **(settings | {"chains": False}))
+
+    with patch("lmshealth.machine.assessment.fit_life", without_chains):
         made = lmshealth.assess(readings_of(logs), stage_of(map_table), seed=seed, **options)
     service, judged = made.service(), made.judgement
     found: Answer = {
