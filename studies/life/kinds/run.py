@@ -65,6 +65,7 @@ _RUNNING_IN = "a loss within the first 3 % of the life is taken for that of the 
 _ONSET = "where a loss began a while ago it may have begun at any of few logs, and may stop"
 _STEPS = "each step of a loss is distinguished from repairs and foreign changes by itself"
 _SLOWER = "a mount that loosens ever more slowly may stop before the limit"
+_RESTORED = "laws are fitted to the logs since the work, two thirds of them or fewer"
 NOT_MET = {
     **{f"preload, bathtub: guide_preload {what}": _RUNNING_IN
        for what in ("is held", "has no bias")},
@@ -78,6 +79,8 @@ NOT_MET = {
     **{f"{kind}: remaining life is narrow": _SLOWER
        for kind in ("mount, loosening", "mount, loosening, map 10 % wrong",
                     "mount, loosening, short logs", "both")},
+    **{f"{kind}: remaining life is narrow": _RESTORED
+       for kind in ("preload, hertz, mount tightened", "mount, loosening, guide replaced")},
     **{f"preload, onset: {what}": _ONSET
        for what in ("services are in time", "remaining life is narrow")},
     **{f"preload, steps: {what}": _STEPS
