@@ -14,7 +14,7 @@ from pathlib import Path, PurePath
 from subprocess import PIPE, STDOUT, Popen, TimeoutExpired
 from tempfile import TemporaryFile
 from threading import Thread
-from typing import IO, NamedTuple
+from typing import IO, Any, NamedTuple
 
 import msgspec
 
@@ -134,13 +134,7 @@ def deliver(store: Store, machines: Sequence[Status], alerts: Alerts, out: Path)
             continue
         with store.alone():
             unsent = waiting(name)  # another run may have delivered some meanwhile
-            rows = [
-                msgspec.to_builtins(one.change)
-                | {"text": str(one.change), "DeviceHealth": status.device_health}
-                | {"page": str(out.absolute() / status.page)}
-                for one in unsent
-                for status in [by_stage[one.change.stage]]
-            ]
+            rows = [_row(one.change, by_stage[one.change.stage], out) for one in unsent]
             content = {"schema": JSON_SCHEMA, "changes": rows}
             why = run_command(command, msgspec.json.encode(content)) if rows else ""
             if why:
@@ -150,6 +144,13 @@ def deliver(store: Store, machines: Sequence[Status], alerts: Alerts, out: Path)
             for one in unsent:
                 store.remove("unsent", machine_key(one.change.stage), one.key)
     return failed
+
+
+def _row(change: Change, status: Status, out: Path) -> dict[str, Any]:
+    """Return a change as an alert has it."""
+    row: dict[str, Any] = msgspec.to_builtins(change)
+    page = str(out.absolute() / status.page)
+    return row | {"text": str(change), "DeviceHealth": status.device_health, "page": page}
 
 
 def write_statuses(machines: Sequence[Status], made: Container[str], out: Path) -> None:

@@ -8,7 +8,7 @@ import os
 import re
 import socket
 from collections.abc import Iterable
-from contextlib import nullcontext, suppress
+from contextlib import suppress
 from pathlib import Path
 from threading import Event, Timer
 from typing import Any
@@ -176,13 +176,17 @@ def _create_table(engine: Engine) -> bool:
 
     Return whether there were tables of an older store, and none of this one.
     """
-    for further in (2, 1, 0):  # PostgreSQL may fail where two runs create it
-        with suppress(SQLAlchemyError) if further else nullcontext():
+    attempts = 3  # PostgreSQL may fail where two runs create it
+    for attempt in range(attempts):
+        try:
             with engine.begin() as connection:
                 existing = set(sql.inspect(connection).get_table_names())
                 if VALUES.name not in existing:
                     connection.execute(CreateTable(VALUES, if_not_exists=True))
             return VALUES.name not in existing and is_older(existing)
+        except SQLAlchemyError:
+            if attempt == attempts - 1:
+                raise
     raise AssertionError  # the last attempt returns or raises
 
 

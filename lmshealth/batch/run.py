@@ -8,7 +8,7 @@ import re
 import threading
 import time
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Container, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, closing, suppress
 from dataclasses import dataclass, field, replace
 from datetime import UTC, date, datetime
@@ -30,6 +30,7 @@ from lmshealth.batch.assess import Machine, apply_fleet_priors, assess_all, reas
 from lmshealth.batch.ingest import Ingested, Settings, ingest
 from lmshealth.batch.store import (
     PackedLogs,
+    Published,
     Resources,
     Store,
     cached,
@@ -275,7 +276,7 @@ def run(
         notes += _of_names(ingested.machines, [one.stage for one in statuses])
     counts, lost = _count(ingested, refused, made)
     if not machines:
-        why = f"{folder}: no usable log: {_none_usable(folder, ingested.logs, refused, lost)}"
+        why = _none_usable(folder, ingested.logs, refused, lost)
         failed_alerts = "".join(f"; {name}: {reason}" for name, reason in unsent.items())
         raise NothingUsable(f"{why}; {out / 'refused.csv'} lists all{failed_alerts}")
     misspelt = tuple(f"{one.log}: {one.detail}" for one in refused if one.reason == MISSPELT)
@@ -324,12 +325,8 @@ def report(
     """
     out = Path(out)
     _prepare(out)
-    announced, published = store.announced(), store.published()
-    # What was announced of a machine that is retired was deleted, but not that of the others of its
-    # folder, which have one list of refused logs with it. With damage it is not known of which.
-    folders = {one.refused for one in published if one.machine in announced}
-    known = folders if not store.damaged["announced"] else ()
-    present = [one for one in published if one.machine in announced or one.refused not in known]
+    announced = store.announced()
+    present = _present(store, announced)
     files = file_names([one.machine for one in present])
     rows, failed = dict[str, Summary](), dict[str, str]()
     progress("reporting", 0, len(present))
@@ -363,6 +360,19 @@ def report(
     )
 
 
+def _present(store: Store, announced: Container[str]) -> list[Published]:
+    """List the published assessments without those of machines that are retired.
+
+    The row of what was announced of such a machine was deleted; other machines of its folder, which
+    have one list of refused logs with it, have theirs.
+    """
+    published = store.published()
+    if store.damaged["announced"]:  # it is not known of which machines
+        return list(published)
+    folders = {one.refused for one in published if one.machine in announced}
+    return [one for one in published if one.machine in announced or one.refused not in folders]
+
+
 def _judging(settings: Settings = Settings()) -> Judging:
     """Return on which day pages and statuses are judged, by default today (UTC)."""
     today = settings.today or datetime.now(UTC).date()
@@ -377,6 +387,18 @@ def _prepare(out: Path) -> None:
         remove_abandoned(out)
     except OSError as error:
         raise LmshealthError(f"{out}: cannot be written to: {error.strerror}") from error
+
+
+def _others(folder: Path, logs: frozenset[str]) -> str:
+    """Return the suffixes of the files of a folder without logs."""
+    if logs:
+        return ""
+    files = (path for path in folder.rglob("*") if path.is_file() and path.name not in NOT_LOGS)
+    counts = Counter(path.suffix for path in files if path.name[0] != ".")
+    found = ", ".join(f"{n} {visible(suffix)}" for suffix, n in counts.most_common(3))
+    if not found:
+        return " (the folder has no files; name the one that has the logs)"
+    return f" (files: {found}; `lmshealth init FILE` tries one)"
 
 
 def _of_names(machines: Iterable[str], announced: Iterable[str]) -> Iterator[str]:
@@ -411,31 +433,26 @@ def _bare(name: str) -> str:
 def _none_usable(
     folder: Path, logs: frozenset[str], refused: Sequence[Refusal], lost: set[str]
 ) -> str:
-    """Return why no log is usable: a manifest that cannot be read, other files, the refusals.
-
-    Of these the most frequent reason, and the first log with its first detail.
-    """
+    """Return why no log is usable; first of a manifest that cannot be read, if there is one."""
     tables = (one for one in refused if PurePosixPath(one.log).name == MANIFEST)
     first = next((one for one in tables if one.reason not in (MISSPELT, "bad-row")), None)
     manifest = "" if first is None else f"{first.log}: {first.detail}; "
-    others = ""
-    if not logs:
-        files = (path for path in folder.rglob("*") if path.is_file() and path.name not in NOT_LOGS)
-        suffixes = Counter(path.suffix for path in files if path.name[0] != ".").most_common(3)
-        others = " (the folder has no files; name the one that has the logs)"
-        if suffixes:
-            found = ", ".join(f"{n} {visible(suffix)}" for suffix, n in suffixes)
-            others = f" (files: {found}; `lmshealth init FILE` tries one)"
+    found = f"{len(logs)} found{_others(folder, logs)}"
+    why = f"{len(lost)} refused{_commonest(refused, lost)}"
+    return f"{folder}: no usable log: {manifest}{found}, {why}"
+
+
+def _commonest(refused: Iterable[Refusal], lost: Container[str]) -> str:
+    """Return the most frequent reason of refused logs, and the detail of the first of them."""
     why: dict[str, dict[str, str]] = {}
-    for one in refused:
-        if one.log in lost:
-            why.setdefault(one.reason, {}).setdefault(one.log, one.detail)
-    commonest = ""
-    if why:
-        reason, details = max(why.items(), key=lambda item: len(item[1]))
-        log, detail = min(details.items())
-        commonest = f": {len(details)} as {reason}, such as {log}: {detail}"
-    return f"{manifest}{len(logs)} found{others}, {len(lost)} refused{commonest}"
+    for refusal in refused:
+        if refusal.log in lost:
+            why.setdefault(refusal.reason, {}).setdefault(refusal.log, refusal.detail)
+    if not why:
+        return ""
+    reason, details = max(why.items(), key=lambda item: len(item[1]))
+    log, detail = min(details.items())
+    return f": {len(details)} as {reason}, such as {log}: {detail}"
 
 
 def _report(
