@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 
@@ -35,13 +34,6 @@ class Case:
     described: tuple[int, ...]  # modes of the description
     declared: Array  # their declared frequencies in Hz
     bound: Array  # least standard deviations of ln f, (n_modes,)
-
-    def request(self) -> dict[str, Any]:
-        """Return what an identification is given, as JSON can express it."""
-        return {
-            "rate": self.sample_rate,
-            "modes": {f"m{k}": f for k, f in zip(self.described, self.declared, strict=True)},
-        }
 
 
 def _stage(rng: np.random.Generator, n_channels: int, n_modes: int, strength: Array) -> Machine:
