@@ -151,8 +151,7 @@ def write_draws(target: Path, stages: Sequence[str], trees: Sequence[DataTree]) 
         for stage, tree in zip(stages, trees, strict=True)
     }
     tree = trees[0] if len(trees) == 1 else DataTree.from_dict(named)
-    with _writing(target):
-        tree.to_netcdf(target, engine="h5netcdf")
+    write_bytes(target, bytes(tree.to_netcdf(engine="h5netcdf")))
 
 
 @contextmanager

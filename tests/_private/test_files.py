@@ -148,3 +148,15 @@ def test_machines_whose_groups_would_have_one_name_keep_their_draws(tmp_path: Pa
     with xr.open_datatree(tmp_path / "draws.nc", engine="h5netcdf") as found:
         values = {name: float(found[f"{name}/posterior"]["x"]) for name in found.children}
     assert values == {"A_1-2": 0, "A_1": 1, "A_2-2": 2, "a-2": 3, "A_2": 4}
+
+
+def test_draws_replace_a_link_and_leave_what_it_names(tmp_path: Path) -> None:
+    """Draws appear whole under their name, as tables do."""
+    other, link = tmp_path / "other", tmp_path / "draws.nc"
+    other.write_text("kept")
+    link.symlink_to(other)
+    write_draws(link, ["A"], [xr.DataTree.from_dict({"posterior": xr.Dataset({"x": 1.0})})])
+    assert other.read_text() == "kept"
+    assert not link.is_symlink()
+    with xr.open_datatree(link, engine="h5netcdf") as found:
+        assert float(found["posterior"]["x"]) == 1.0
