@@ -561,7 +561,7 @@ def test_a_pole_that_becomes_a_line_leaves_no_part_of_it() -> None:
     """Means of ordinates show only where about a line is: it is masked where it is strongest."""
     c = case("mains in the band of a mode", 15)
     log = make_log({f"acc_{k}": row.copy() for k, row in enumerate(c.samples.T)}, c.sample_rate)
-    modes = [(name, f, 0.012) for name, f in c.request()["modes"].items()]
+    modes = [(f"m{k}", f, 0.012) for k, f in zip(c.described, c.declared, strict=True)]
     found = identify(log, make_stage(modes))
     assert found.names == ("m0", "m1", "m2")
     error = np.abs(found.frequency - c.frequency) / found.frequency_std
