@@ -63,6 +63,22 @@ def _undescribed(rng: np.random.Generator) -> Machine:
     return _stage(rng, 4, 4, np.full(4, 5e3))
 
 
+def _one_force(rng: np.random.Generator) -> Machine:
+    return replace(_white(rng, 4), shared=1.0, strength=np.full(3, 300.0))
+
+
+def _beside(rng: np.random.Generator) -> Machine:
+    """Draw a stage that one force moves, with a mode below and one above the described band."""
+    inner = _one_force(rng)
+    return replace(
+        inner,
+        frequency=np.array([62.0, *inner.frequency, 310.0]),
+        damping_ratio=np.array([0.012, *inner.damping_ratio, 0.012]),
+        strength=np.full(5, 300.0),
+        shapes=shapes_of(rng, 4, 5),
+    )
+
+
 def _mains(rng: np.random.Generator) -> Machine:
     machine = _stage(rng, 3, 3, np.full(3, 5e3))
     level = float(10 ** rng.uniform(-1, 1))
@@ -99,6 +115,8 @@ WORLDS: dict[str, tuple[Callable[[np.random.Generator], Machine], float, float, 
     "mains in the band of a mode": (_mains, 1000.0, 20.0, 32),
     "8 channels, 6 modes, two harmonics": (_many, 200.0, 300.0, 24),
     "16 channels, 6 modes, two harmonics": (lambda rng: _many(rng, 16), 200.0, 300.0, 12),
+    "one force moves all modes": (_one_force, 1000.0, 20.0, 32),
+    "one force moves all modes, two of them outside the band": (_beside, 1000.0, 20.0, 32),
 }  # fmt: skip
 
 
@@ -113,12 +131,15 @@ def case(kind: str, number: int) -> Case:
         samples, noise = _with_more_noise(rng, samples, rate)
     n = machine.frequency.size
     left_out = int(rng.integers(1, n - 1)) if kind == "a mode is not described" else -1
-    described = tuple(k for k in range(n) if k != left_out)
+    low, high = machine.band
+    described = tuple(k for k in range(n) if k != left_out and low < machine.frequency[k] < high)
     off = 0.01 * rng.uniform(-1, 1) + 0.004 * rng.standard_normal(n)
-    force = np.diag(machine.strength * 4 * machine.damping_ratio**2)
+    force = machine.strength * 4 * machine.damping_ratio**2
+    common = machine.shared * np.sqrt(np.outer(force, force))
     # Of more channels than eight the bound takes hours, and is hardly less.
     modes = Vibration(machine.frequency, machine.damping_ratio, machine.shapes[:8])
-    cov = joint_bound(modes, force, Recording(noise[:8], seconds, machine.band))
+    matrix = common + (1 - machine.shared) * np.diag(force)
+    cov = joint_bound(modes, matrix, Recording(noise[:8], seconds, machine.band))
     return Case(
         samples,
         rate,
