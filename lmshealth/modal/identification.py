@@ -73,6 +73,8 @@ _CEILING = 4.0
 # these limits: less costs information about floors, bends and static responses, up to half of the
 # whole, and further away the floors of real machines are not as simple as the likelihood assumes.
 _LEAST_REACH, _MOST_REACH = 6.0, 16.0
+# Factor beyond the ends of the band that was searched to which a fit may reach.
+_OUTSIDE = 1.25
 # A band whose ends have a larger ratio than the first is searched in parts up to the second, as no
 # simple floors hold over it; each is searched up to the third ratio beyond its ends, and the edges
 # are shifted up to the fourth where no mode is.
@@ -623,6 +625,8 @@ def _fit_group(
     ]
     low = max(low, min(t.frequency - width for t, width in zip(near, reach, strict=True)))
     high = min(high, max(t.frequency + width for t, width in zip(near, reach, strict=True)))
+    # Further outside of the band that was searched there may be modes that no model has.
+    low, high = max(low, found.band[0] / _OUTSIDE), min(high, found.band[1] * _OUTSIDE)
     noise = found.noise((near[0].frequency * near[-1].frequency) ** 0.5)
     around = found.around(near, low, high)
     fit = fit_modes(
