@@ -6,12 +6,13 @@ Method
     eight channels with floors that are unequal, sloped and coherent; two modes 1 % apart; a mode
     that nobody described; mains in the band of a mode; six modes with a steady and a wandering
     harmonic in 8 and 16 channels (with the bound of the first eight); one force that moves all
-    modes, 25 dB above the floors, without and with modes outside the band. Errors of ln f are
-    compared with the Cramér-Rao bound of all channels with unknown shapes, forces and white noise,
-    over a band 25 % beyond the outer modes (of sloped and coherent floors it is that of white ones
-    of the same level at 130 Hz), and with the standard deviations that are published. A mode is
-    wrong if another one is nearer. Controls: intervals two thirds as wide, which must not cover;
-    the first half of records of 2 and 4 channels, whose errors must miss the bound of whole ones.
+    modes, 25 dB above the floors in four channels, and 40 dB in three with stronger modes outside
+    the band. Errors of ln f are compared with the Cramér-Rao bound of all channels with unknown
+    shapes, forces and white noise, over a band 25 % beyond the outer modes (of sloped and coherent
+    floors it is that of white ones of the same level at 130 Hz), and with the standard deviations
+    that are published. A mode is wrong if another one is nearer. Controls: intervals two thirds as
+    wide, which must not cover; the first half of records of 2 and 4 channels, whose errors must
+    miss the bound of whole ones.
 Run time
     Ten minutes on one processor.
 """

@@ -68,14 +68,15 @@ def _one_force(rng: np.random.Generator) -> Machine:
 
 
 def _beside(rng: np.random.Generator) -> Machine:
-    """Draw a stage that one force moves, with a mode below and one above the described band."""
-    inner = _one_force(rng)
+    """Draw a stage that one force moves, with strong modes below and above the described band."""
+    inner = _white(rng, 3)
     return replace(
         inner,
         frequency=np.array([62.0, *inner.frequency, 310.0]),
         damping_ratio=np.array([0.012, *inner.damping_ratio, 0.012]),
-        strength=np.full(5, 300.0),
-        shapes=shapes_of(rng, 4, 5),
+        strength=np.array([1e5, 1e4, 1e4, 1e4, 1e4]),
+        shapes=shapes_of(rng, 3, 5),
+        shared=1.0,
     )
 
 
@@ -116,7 +117,7 @@ WORLDS: dict[str, tuple[Callable[[np.random.Generator], Machine], float, float, 
     "8 channels, 6 modes, two harmonics": (_many, 200.0, 300.0, 24),
     "16 channels, 6 modes, two harmonics": (lambda rng: _many(rng, 16), 200.0, 300.0, 12),
     "one force moves all modes": (_one_force, 1000.0, 20.0, 32),
-    "one force moves all modes, two of them outside the band": (_beside, 1000.0, 20.0, 32),
+    "one force moves all modes, strong ones outside the band": (_beside, 1000.0, 20.0, 32),
 }  # fmt: skip
 
 
