@@ -49,9 +49,9 @@ NOT_MET = {
     "fine as it is",
     **dict.fromkeys(
         (f"{what}: {_OUTSIDE}" for what in ("near the bound", "none missing or wrong")),
-        "what stronger modes outside leave in the band is described by broad poles and floors, which "
-        "costs most of what one force tells about its modes; of 96 modes 5 are refused, none is "
-        "wrong, and intervals hold",
+        "what stronger modes outside leave in the band is described by broad poles and floors, "
+        "which costs most of what one force tells about its modes; of 96 modes 5 are refused, none "
+        "is wrong, and intervals hold",
     ),
 }
 
