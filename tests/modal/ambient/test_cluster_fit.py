@@ -28,7 +28,7 @@ from lmshealth.modal.targets import Target
 from lmshealth.signal.segments import Segment
 from lmshealth.signal.spectra import CrossSpectrum, LogSpectra, cross_spectra
 from studies.modes.described.worlds import case
-from studies.modes.without_description.worlds import Machine, record, shapes_of
+from studies.modes.without_description.worlds import Machine, log_of, record, shapes_of
 from tests.bands import (
     PITCH,
     RATE,
@@ -571,14 +571,13 @@ def test_a_pole_that_becomes_a_line_leaves_no_part_of_it() -> None:
 
 @pytest.mark.parametrize("seed", [3, 4])
 def test_modes_far_above_floors_that_one_direction_shows_are_found(seed: int) -> None:
-    """Four sensors without noise to speak of: the search follows a long curved valley."""
+    """Four sensors with floors 80 dB below the modes: the search takes more than 100 steps."""
     r, f = np.random.default_rng(seed), np.array([117.0, 131.0, 148.0])
     machine = Machine(
         f, np.array([0.012, 0.015, 0.01]), np.full(3, 1e8), shapes_of(r, 4, 3), shared=0.0,
         band=(90.0, 185.0),
     )  # fmt: skip
-    samples = record(r, "low floors", machine, 1000.0, 20.0).samples
-    log = make_log({f"acc_{k}": row.copy() for k, row in enumerate(samples.T)}, 1000.0)
+    log = log_of(record(r, "low floors", machine, 1000.0, 20.0))
     found = identify(log, make_stage([(f"m{k}", 1.004 * x, 0.012) for k, x in enumerate(f)]))
     assert found.names == ("m0", "m1", "m2")
     assert (np.abs(found.frequency - f) / found.frequency_std).max() < 4
