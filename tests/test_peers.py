@@ -56,7 +56,10 @@ def write(path: Path, record: dict[str, Any]) -> None:
 
 def test_modes_are_compared_on_the_records_of_the_peer(tmp_path: Path) -> None:
     """Of ours only the records count that a peer searched; small differences are equal."""
-    peer = {"records": 2, "there": 40, "found": 20, "false": 0, "time_over_ours": 0.1}
+    peer = {
+        "records": 2, "there": 40, "found": 20, "false": 0, "time_over_ours": 0.1,
+        "errors": {"f": {"n": 0}, "zeta": {"n": 0}}, "coverage": {},
+    }  # fmt: skip
     family = {
         "coverage": {"f": {"hits": 99, "n": 100}},
         "imperfect": [
@@ -65,7 +68,17 @@ def test_modes_are_compared_on_the_records_of_the_peer(tmp_path: Path) -> None:
         ],
         "others": {
             "koma SSI": peer,
-            "pyOMA2 SSI, Neu": peer | {"found": 38, "false": 8, "time_over_ours": 1.1},
+            "pyOMA2 SSI, Neu": peer
+            | {
+                "found": 38,
+                "false": 8,
+                "time_over_ours": 1.1,
+                "errors": {
+                    "f": {"n": 38, "ours": 0.001, "theirs": 0.0008, "worse_by": [-3.6e-7, 1e-7]},
+                    "zeta": {"n": 38, "ours": 0.1, "theirs": 0.11, "worse_by": [0.0021, 0.0011]},
+                },
+                "coverage": {"f": {"hits": 30, "n": 38}},
+            },
             "peaks of single channels": peer,
         },
     }
@@ -76,7 +89,10 @@ def test_modes_are_compared_on_the_records_of_the_peer(tmp_path: Path) -> None:
     assert koma[4:] == [
         "99 of 100; states none", "0.1", f"found: lmshealth; others: {PEER}; time: {PEER}",
     ]  # fmt: skip
-    assert pyoma2[-1] == "found: equal; others: equal; time: equal"
+    assert pyoma2[2:5] == ["39 of 40, 9; 0.1 %, 10 %", "38 of 40, 8; 0.08 %, 11 %",
+                           "99 of 100; 30 of 38"]  # fmt: skip
+    who = f"found: equal; others: equal; f: {PEER}; ζ: equal; intervals: lmshealth; time: equal"
+    assert pyoma2[-1] == who
 
 
 @pytest.mark.parametrize(("shift", "better"), [(-60.0, PEER), (60.0, "lmshealth"), (0.0, "equal")])

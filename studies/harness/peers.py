@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 from collections import defaultdict
 from collections.abc import Iterator, Sequence
+from itertools import starmap
 from pathlib import Path
 from typing import Any
 
@@ -22,12 +23,13 @@ from studies.harness.study import STUDIES
 
 # Peer, world, our figures and theirs, intervals that hold, time over ours, who is better in what.
 Row = tuple[str, str, str, str, str, float | None, dict[str, str]]
-LEVEL, SURE, STATED, SAME_TIME, SAME_NUMBERS = 0.05, 2.0, 0.9, 1.15, 1e-6
+LEVEL, SURE, SAME_TIME, SAME_NUMBERS = 0.05, 2.0, 1.15, 1e-6
 OURS, PEER, SAME = "lmshealth", "**peer**", "equal"
-CONTROL, STATES_STD = "peaks of single channels", "VarPLSCF"
+CONTROL = "peaks of single channels"
 HEAD = ("peer", "world", OURS, "the peer", "intervals that hold", "time over ours", "better")
 TABLES = {
-    "Modes: those found, and all other estimates": ("pyOMA2", "pyoma-toolbox", "koma"),
+    "Modes: those found, all other estimates, and errors of f and ζ": (
+        "pyOMA2", "pyoma-toolbox", "koma"),
     "Tracking: differences of ln f, and of its std": ("filterpy", "simdkalman", "statsmodels"),
     "Remaining life: score (CRPS, km), and root mean square error of ln preload now": (
         "progpy", "plain particle filter", "straight line"),
@@ -62,15 +64,25 @@ def lines(studies: Path = STUDIES) -> list[str]:
 def drawn_modes(record: Any) -> Iterator[Row]:
     """Compare modes on drawn records that a peer searched, which are the first of ours."""
     for family, one in record.get("families", {}).items():
-        held = "{hits} of {n}; ".format(**one["coverage"]["f"])
         for name, row in one["others"].items():
+            if name == CONTROL:
+                continue
             short = [own for own in one["imperfect"] if own["seed"] < row["records"]]
             missed, false = (sum(len(r[k]) for r in short) for k in ("missed_hz", "false_hz"))
             n, world = row["there"], f"{family}, {row['records']} records"
             *cells, better = _counted(n, (n - missed, row["found"]), (false, row["false"]))
-            theirs = "not recorded" if STATES_STD in name else "states none"
-            if name != CONTROL:
-                yield name, world, *cells, held + theirs, row["time_over_ours"], better
+            compared = {q: row["errors"][key] for q, key in (("f", "f"), ("ζ", "zeta"))}
+            for whose, k in (("ours", 0), ("theirs", 1)):
+                errors = [f"{number(100 * e[whose])} %" for e in compared.values() if e["n"]]
+                cells[k] += f"; {', '.join(errors)}" * bool(errors)
+            better |= {q: _who(e["worse_by"][0], SURE * e["worse_by"][1])
+                       for q, e in compared.items() if e["n"] > 1}  # fmt: skip
+            held = [(c["hits"], c["n"]) for c in (one["coverage"]["f"], row["coverage"].get("f"))
+                    if c]  # fmt: skip
+            if len(held) == 2:
+                better["intervals"] = _nearer(held, 0.95)
+            text = "; ".join([*map("{0[0]} of {0[1]}".format, held), "states none"][:2])
+            yield name, world, *cells, text, row["time_over_ours"], better
 
 
 def known_modes(record: Any) -> Iterator[Row]:
@@ -126,9 +138,8 @@ def lives(record: Any) -> Iterator[Row]:
                 continue
             pairs = zip(rows[0][key], rows[1][key], strict=True)
             gain, error = mean([b - a for a, b in pairs if None not in (a, b)])
-            ends = (clopper_pearson(*row["held"]) for row in rows)
-            right, theirs = (float(low <= STATED <= high) for low, high in ends)
-            better |= {what: _who(gain, SURE * error), f"{what}, intervals": _who(right - theirs)}
+            intervals = _nearer([row["held"] for row in rows], 0.9)
+            better |= {what: _who(gain, SURE * error), f"{what}, intervals": intervals}
             for row, cell, counts in zip(rows, cells, held, strict=True):
                 value, error = mean(row[key])
                 root = number(value**0.5)
@@ -137,6 +148,12 @@ def lives(record: Any) -> Iterator[Row]:
         texts = [*map(", ".join, cells), "; ".join(map(", ".join, held))]
         ratio = both[1]["cpu_s"] / both[0]["cpu_s"] or None
         yield name, f"{kind}, {both[0]['n']} lives", *texts, ratio, better
+
+
+def _nearer(held: Sequence[Sequence[int]], stated: float) -> str:
+    """Return whose intervals hold what they state, of ours and theirs that hold, of so many."""
+    ours, theirs = (float(low <= stated <= high) for low, high in starmap(clopper_pearson, held))
+    return _who(ours - theirs)
 
 
 def _who(gain: float, error: float = 0.0) -> str:

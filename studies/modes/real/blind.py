@@ -115,7 +115,7 @@ def examine(one: Set, *, peers: bool) -> Row:
         world = World(name, log.sample_rate, samples, 0, band, np.array(known), nothing)
         found = pyoma2(world) | koma(world)
         found |= toolbox(world, method="SSI") | toolbox(world, method="VarPLSCF")
-        row["others"] = {tool: count(f, known, reach) for tool, (f, _) in found.items()}
+        row["others"] = {tool: count(one.frequency, known, reach) for tool, one in found.items()}
     return row
 
 

@@ -3,7 +3,9 @@
 The record is decimated to the lowest rate above 2.5 times the top of the band, displacements are
 differentiated twice and channels scaled to unit variance. Models reach order 40 (60 of pyOMA2 above
 four channels), with as many block rows as lags of a third of a second hold, 20 to 40 of them.
-Everything else is the default of the program. Poles outside the band are discarded.
+Everything else is the default of the program. Poles outside the band, or undamped, are discarded.
+Standard deviations are those that a program states with its estimates; pyOMA2 searches once more
+for them, as it then takes many times as long and drops uncertain poles.
 """
 
 from __future__ import annotations
@@ -12,9 +14,10 @@ import io
 import logging
 import time
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import redirect_stdout
 from functools import partial
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,9 +26,18 @@ from scipy.signal import decimate, find_peaks, welch
 from studies.modes.without_description.worlds import World
 
 Array = NDArray[np.float64]
-# Frequencies in Hz and processor time in s, by the name of the program.
-Found = dict[str, tuple[Array, float]]
 
+
+class Found(NamedTuple):
+    """Modes that a program found; nan is what it does not state."""
+
+    frequency: Array  # Hz, ``(n_modes,)``
+    damping_ratio: Array  # ``(n_modes,)``
+    std: Array  # of ln f and ln ζ, ``(2, n_modes)``
+    seconds: float  # processor time
+
+
+CONTROL = "peaks of single channels"
 PRESETS = ("Magalhaes", "Reynders", "Neu", "Kvaale", "Dederichs", "hdbscan", "hier_avg")
 _LAG = 1 / 3  # s
 _LARGEST_DAMPING = 0.1
@@ -42,7 +54,7 @@ def _prepare(world: World) -> tuple[Array, float]:
     return (samples - samples.mean(axis=0)) / samples.std(axis=0), rate
 
 
-def pyoma2(world: World) -> Found:
+def pyoma2(world: World, *, with_std: bool = False) -> dict[str, Found]:
     """Search with covariance-driven SSI of pyOMA2, clustered by each of its presets."""
     from pyoma2.algorithms import SSI
     from pyoma2.algorithms.data.run_params import Clustering
@@ -50,30 +62,31 @@ def pyoma2(world: World) -> Found:
 
     start = time.process_time()
     samples, rate = _prepare(world)
-    algorithm = SSI(name="ssi", br=_rows(rate), ordmax=40 if samples.shape[1] <= 4 else 60)
+    order = 40 if samples.shape[1] <= 4 else 60
+    algorithm = SSI(name="ssi", br=_rows(rate), ordmax=order, calc_unc=with_std)
     setup = SingleSetup(samples, fs=rate)
     setup.add_algorithms(algorithm)
 
-    def poles() -> Array:
+    def poles() -> Sequence[Array]:
         setup.run_by_name("ssi")
-        return np.empty(0)
+        return np.empty(0), np.empty(0)
 
-    def clustered(name: str) -> Array:
+    def clustered(name: str) -> Sequence[Array]:
         algorithm.add_clustering(Clustering(name=name, quick=name, freqlim=world.band))
         algorithm.run_clustering(name=name)
-        return np.asarray(algorithm.result.clustering_results[name].Fn)
+        one = algorithm.result.clustering_results[name]
+        return one.Fn, one.Xi, *([one.Fn_std, one.Xi_std] if with_std else [])
 
-    _found(poles, world.band)
-    alone = time.process_time() - start
-    found: Found = {}
+    alone = _found(poles, world.band, start).seconds
+    found = {}
     for name in PRESETS:
-        start = time.process_time()
-        f = _found(partial(clustered, name), world.band)
-        found[f"pyOMA2 SSI, {name}"] = f, alone + time.process_time() - start
+        start = time.process_time() - alone
+        program = f"pyOMA2 SSI{' with std' * with_std}, {name}"
+        found[program] = _found(partial(clustered, name), world.band, start)
     return found
 
 
-def koma(world: World) -> Found:
+def koma(world: World) -> dict[str, Found]:
     """Search with SSI of koma, in clusters of ten stable poles: order 40 has at most 20."""
     from koma.clustering import PoleClusterer, group_clusters
     from koma.oma import covssi, find_stable_poles
@@ -82,18 +95,18 @@ def koma(world: World) -> Found:
     samples, rate = _prepare(world)
     orders = np.arange(2, 42 if samples.shape[1] <= 4 else 62, 2)
 
-    def search() -> Array:
+    def search() -> Sequence[Array]:
         poles = covssi(samples, rate, _rows(rate), orders, showinfo=False)
         range_ = {"freq": [0, np.inf], "damping": [0, _LARGEST_DAMPING], "mpc": [0, 1]}
         *stable, _ = find_stable_poles(*poles, s=2, valid_range=range_)
         clusters = PoleClusterer(*stable, min_samples=10, min_cluster_size=10).postprocess()
-        return np.array([np.median(omega) for omega in group_clusters(*clusters)[1]]) / (2 * np.pi)
+        zeta, omega = ([np.median(one) for one in each] for each in group_clusters(*clusters)[:2])
+        return np.array(omega) / (2 * np.pi), np.array(zeta)
 
-    f = _found(search, world.band)
-    return {"koma SSI": (f, time.process_time() - start)}
+    return {"koma SSI": _found(search, world.band, start)}
 
 
-def toolbox(world: World, *, method: str) -> Found:
+def toolbox(world: World, *, method: str) -> dict[str, Found]:
     """Search with a method of pyoma-toolbox, and its automatic clearing and selection."""
     from pyOMA.core.PreProcessingTools import PreProcessSignals
     from pyOMA.core.SSICovRef import BRSSICovRef
@@ -104,7 +117,7 @@ def toolbox(world: World, *, method: str) -> Found:
     samples, rate = _prepare(world)
     signals = PreProcessSignals(samples, rate)
 
-    def search() -> Array:
+    def search() -> Sequence[Array]:
         if method == "SSI":
             rows = _rows(rate)
             signals.correlation(2 * rows + 2)
@@ -122,13 +135,14 @@ def toolbox(world: World, *, method: str) -> Found:
         cluster.automatic_clearing()
         cluster.automatic_classification()
         cluster.automatic_selection()
-        return np.array(cluster.get_selected_modal_values()[0], dtype=float)
+        f, percent, *_, f_std, percent_std, _ = cluster.get_selected_modal_values()
+        std = [] if f_std is None else [f_std, np.divide(percent_std, 100)]
+        return f, np.divide(percent, 100), *std
 
-    f = _found(search, world.band)
-    return {f"pyoma-toolbox {method}": (f, time.process_time() - start)}
+    return {f"pyoma-toolbox {method}": _found(search, world.band, start)}
 
 
-def peaks(world: World) -> Array:
+def peaks(world: World) -> dict[str, Found]:
     """Pick the peaks of the spectrum of each channel (control).
 
     A peak exceeds its surroundings by six standard deviations of a mean of ordinates; peaks of
@@ -150,7 +164,8 @@ def peaks(world: World) -> Array:
     for place, _ in sorted(every, key=lambda one: -one[1]):
         if all(abs(place / other - 1) > 0.01 for other in chosen):
             chosen.append(float(place))
-    return np.sort(chosen)
+    f = np.sort(chosen)
+    return {CONTROL: Found(f, f * np.nan, np.full((2, f.size), np.nan), 0.0)}
 
 
 def _peaks(level: Array, prominence: float) -> tuple[NDArray[np.intp], Array]:
@@ -162,15 +177,20 @@ def _rows(rate: float) -> int:
     return int(np.clip(_LAG * rate, 20, 40))
 
 
-def _found(search: Callable[[], Array], band: tuple[float, float]) -> Array:
-    """Call a program without its messages; nothing found where it raises."""
+def _found(search: Callable[[], Sequence[Array]], band: tuple[float, float], start: float) -> Found:
+    """Call a program without its messages; nothing is found where it raises."""
+    values = np.empty((4, 0))
     with warnings.catch_warnings(), redirect_stdout(io.StringIO()), np.errstate(all="ignore"):
         warnings.simplefilter("ignore")
         logging.disable(logging.CRITICAL)
         try:
-            f = search()
+            found = np.array(search(), dtype=float)
+            values = np.full((4, found.shape[1]), np.nan)
+            values[: len(found)] = found
         except Exception:  # of any kind: these are programs of others
-            return np.empty(0)
+            pass
         finally:
             logging.disable(logging.NOTSET)
-    return np.sort(f[(f >= band[0]) & (f <= band[1])])
+    inside = (values[0] >= band[0]) & (values[0] <= band[1]) & (values[1] > 0)
+    f, zeta, *std = values[:, inside][:, np.argsort(values[0, inside])]
+    return Found(f, zeta, np.array(std) / [f, zeta], time.process_time() - start)
