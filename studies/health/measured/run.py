@@ -76,6 +76,7 @@ def one_machine(machine: Machine, scratch: Path, *, quick: bool) -> Row:
         - (machine.set != "building"),
         # Of a machine of which no log can be used for days nothing is known any more.
         "verdict": "unknown" if status["unknown_since"] else status["verdict"],
+        "verdict_at_last_log": status["verdict_at_last_log"],
         "why": status["why"],
         # Only of these a value is stated on the page.
         "certified": not status["unknown_since"]
@@ -138,6 +139,8 @@ def claims(answer: Row) -> Iterator[Claim]:
         }[row["kind"]]
         what = f"{row['set']}: {row['parameter'].removesuffix('_mm')} known, {state}"
         beside = f"{row['estimates']} of {row['logs']} logs"
+        if row["verdict"] != row["verdict_at_last_log"]:
+            beside += f"; at the last that could be used it was {row['verdict_at_last_log']}"
         if row["kind"] == "beyond":
             beside += "; the description does not hold it"
         yield Claim(what, value, interval, beside, bool(right))

@@ -90,9 +90,9 @@ NOT_MET = {
                     "preload, linear, a sudden loss", "preload, linear, common wander")},
 }  # fmt: skip
 # Checks that a claim of health (after the name of the parameter), verdicts or life stands for.
-OF_HEALTH = ("is published", "is held", "has no bias", "is narrow", "is held by not too many")
-OF_VERDICTS = ("the mode is named", "no part is surely degraded", "no alarm")
-OF_LIFE = ("remaining life is held", "services are in time", "remaining life is narrow")
+HELD = ("is published", "is held", "is held by not too many")
+PRECISE = ("has no bias", "is narrow")
+OF_VERDICTS = ("the mode is named", "the part is named", "no part is surely degraded", "no alarm")
 
 
 def main() -> None:
@@ -178,18 +178,25 @@ def _asked(kind: str, row: Row) -> Iterator[tuple[str, bool]]:
         mean, error = own["bias"]
         yield f"{name} has no bias", abs(mean) <= BIAS + 2 * loose * error
         yield f"{name} is narrow", (own["width_over_ideal"] or 0.0) <= WIDTH
-    if kind in LONE:
-        yield "the mode is named", row["right"]["high"] >= NAMED
-        yield "no part is surely degraded", row["surely_degraded"]["hits"] == 0
-    if kind in HEALTHY:
-        yield "no alarm", row["right"]["high"] >= 1 - ALARMS
-        for name, own in row["health"].items():
-            yield f"{name} is held by not too many", own["held_90"]["low"] <= STAYS_HELD
+    yield from _asked_of_verdicts(kind, row)
     if row["left_90"]:
         yield "remaining life is held", row["left_90"]["high"] >= LEFT_HELD
         yield "services are in time", row["late"]["low"] <= LATE
     if row["left_width"]:
         yield "remaining life is narrow", row["left_width"] <= LEFT_WIDTH
+
+
+def _asked_of_verdicts(kind: str, row: Row) -> Iterator[tuple[str, bool]]:
+    if kind in LONE:
+        yield "the mode is named", row["right"]["high"] >= NAMED
+        yield "no part is surely degraded", row["surely_degraded"]["hits"] == 0
+    elif kind in HEALTHY:
+        yield "no alarm", row["right"]["high"] >= 1 - ALARMS
+        for name, own in row["health"].items():
+            yield f"{name} is held by not too many", own["held_90"]["low"] <= STAYS_HELD
+            yield f"{name} is held", own["held_90"]["high"] >= HELD_90[0]
+    elif row["right"]:
+        yield "the part is named", row["right"]["high"] >= NAMED
 
 
 def _within(share: Row, ends: tuple[float, float], loose: float) -> bool:
@@ -207,15 +214,26 @@ def claims(answered: Row) -> Iterator[Claim]:
             return all(passed.get(f"{kind}: {what}", True) for what in whats)
 
         names = list(row["health"]) if kind in HEALTHY else moving(kind)
+        stays = "machines that stay, mostly with all draws at the baseline: " * (kind in HEALTHY)
         for name in (name for name in names if name in row["health"]):
-            own = row["health"][name]
+            own, which = row["health"][name], f"{kind}, {name.replace('_', ' ')}"
             yield counted(
-                f"90 % intervals hold: {kind}, {name.replace('_', ' ')}",
+                f"{stays}90 % intervals hold: {which}",
                 own["held_90"]["hits"],
                 own["n"],
-                _beside(own),
-                met=fine(*(f"{name} {what}" for what in OF_HEALTH)),
+                f"50 %: {_share(own['held_50'])}; "
+                f"{NARROW} of the width: {_share(own['held_90_narrow'])}",
+                met=fine(*(f"{name} {what}" for what in HELD)),
             )
+            if own["width_over_ideal"]:
+                mean, error = own["bias"]
+                yield Claim(
+                    f"width over that of an estimator that knows the course: {which}",
+                    number(own["width_over_ideal"]),
+                    f"which holds {_share(own['ideal_held_90'])}",
+                    f"bias of ln {mean:+.4f} ± {error:.4f}, rms {number(own['rms'])}",
+                    fine(*(f"{name} {what}" for what in PRECISE)),
+                )
         if right := row["right"]:
             counts = ", ".join(f"{word} {n}" for word, n in sorted(row["verdicts"].items()))
             beside = (f"{number(row['expected'])} by their probabilities; {_sure(row)}; "
@@ -223,11 +241,15 @@ def claims(answered: Row) -> Iterator[Claim]:
             what, n = f"verdicts that are right: {kind}", right["n"]
             yield counted(what, right["hits"], n, beside, met=fine(*OF_VERDICTS))
         if left := row["left_90"]:
-            width = "none" if row["left_width"] is None else number(row["left_width"])
-            beside = f"median width over the truth at 90 % of life {width}; "
-            beside += f"services too late {row['late']['hits']}"
             yield counted(f"90 % intervals of the remaining life hold: {kind}", left["hits"],
-                          left["n"], beside, met=fine(*OF_LIFE))  # fmt: skip
+                          left["n"], met=fine("remaining life is held"))  # fmt: skip
+            yield counted(f"services that come too late: {kind}", row["late"]["hits"],
+                          row["late"]["n"], f"{100 * LATE:.0f} % accepted",
+                          met=fine("services are in time"))  # fmt: skip
+        if row["left_width"]:
+            yield Claim(f"median width of the remaining life over the truth, at 90 % of it: {kind}",
+                        number(row["left_width"]), "", f"{LEFT_WIDTH:g} required",
+                        fine("remaining life is narrow"))  # fmt: skip
 
 
 def _share(row: Row) -> str:
@@ -237,17 +259,6 @@ def _share(row: Row) -> str:
 def _sure(row: Row) -> str:
     return (f"degraded with p > 0.9 {row['surely_degraded']['hits']}, "
             f"service within 90 days {row['soon']['hits']}")  # fmt: skip
-
-
-def _beside(own: Row) -> str:
-    """Format what stands beside the coverage at 90 %."""
-    mean, error = own["bias"]
-    ratio, best = own["width_over_ideal"], own["ideal_held_90"]
-    text = f"50 %: {_share(own['held_50'])}; bias of ln {mean:+.4f} ± {error:.4f}, rms "
-    text += number(own["rms"])
-    if ratio:
-        text += f", width {ratio:.2f} of the ideal, which holds {_share(best)}"
-    return f"{text}; {NARROW} of the width: {_share(own['held_90_narrow'])}"
 
 
 if __name__ == "__main__":
