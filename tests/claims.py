@@ -70,8 +70,8 @@ class Claims:
     of : int
         Number of claims of the whole suite.
     p, controls : dict
-        P values by claim; of several controls of a claim the largest. They may have ``shares`` and
-        ``places`` (`tests.statistical.evidence`).
+        P values by claim; of several controls of a claim the largest. They may have ``shares``,
+        ``places`` and ``text`` (`tests.statistical.evidence`).
     """
 
     link: str
@@ -127,9 +127,10 @@ class Claims:
 
 
 def _kept(p: float) -> dict[str, Any]:
-    """Return the counts and places of a p value, as lists that workers can send."""
+    """Return the counts, places and text of a p value, in lists that workers can send."""
     shares = [list(one) for one in getattr(p, "shares", ())]
-    return {"shares": shares, "places": list(getattr(p, "places", ()))}
+    return {"shares": shares, "places": list(getattr(p, "places", ())),
+            "text": getattr(p, "text", "")}  # fmt: skip
 
 
 KEY = pytest.StashKey[Claims]()

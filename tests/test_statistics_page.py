@@ -52,6 +52,17 @@ def test_the_page_has_all_claims(
     assert "0.5 % (0.0127 to 2.75)" in page
 
 
+def test_a_sum_of_squares_has_its_mean_and_interval(tmp_path: Path) -> None:
+    """The interval holds the true mean square where the sum is what it should be."""
+    claims = Claims("filter", Part(9, ("errors",)), 0.01, 1)
+    claims.claim("errors", evidence.sum_of_squares(110, 100))
+    (row,) = claims.rows()
+    assert row["text"] == "mean square 1.1 (0.849 to 1.48), stated 1"
+    write_page(tmp_path / "page.html", [{**row, "name": "tracking: errors"}], [(0.01, False)],
+               failed=False, made="today")  # fmt: skip
+    assert row["text"] in (tmp_path / "page.html").read_text(encoding="utf-8")
+
+
 def test_some_claims_are_not_all(tmp_path: Path) -> None:
     """A run of some tests holds no more than these."""
     made = rows()[:1]

@@ -100,6 +100,18 @@ def test_tracking_filter(root: Path) -> None:
     assert len(programs) == 5 - len(answer["speed"]["missing"])
 
 
+def test_peers_of_tracks(root: Path) -> None:
+    """All programs are scored alike, and outliers disturb ours least."""
+    pytest.importorskip("simdkalman")
+    pytest.importorskip("statsmodels")
+    kinds = json.loads(run_study(root, "studies.track.peers"))["kinds"]
+    for one in kinds.values():
+        programs = one["programs"]
+        assert all(row["held"]["n"] == 6 for row in programs.values())
+        errors = {name: row["rms"] for name, row in programs.items() if "half" not in name}
+    assert min(errors, key=lambda name: errors[name]) == "lmshealth"
+
+
 def test_three_methods(root: Path) -> None:
     """FRF, following error and accelerometers agree on guide modes, and controls do not."""
     answer = json.loads(run_study(root, "studies.paper.three_methods.run"))

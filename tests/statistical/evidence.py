@@ -14,17 +14,18 @@ from scipy import stats
 
 
 class Evidence(float):
-    """A p value with its counts (hits, number, stated share, side) and places of truths."""
+    """A p value with its counts (hits, number, stated share, side), places of truths, or a text."""
 
     shares: tuple[tuple[int, int, float, str], ...]
     places: tuple[float, ...]
+    text: str
 
     def __new__(
-        cls, p: float, shares: Iterable[Any] = (), places: Iterable[float] = ()
+        cls, p: float, shares: Iterable[Any] = (), places: Iterable[float] = (), text: str = ""
     ) -> Evidence:
         """Keep what a p value is of."""
         made = super().__new__(cls, p)
-        made.shares, made.places = tuple(shares), tuple(places)
+        made.shares, made.places, made.text = tuple(shares), tuple(places), text
         return made
 
 
@@ -80,6 +81,8 @@ def uniform(places: ArrayLike) -> Evidence:
     return Evidence(found, found.shares, places.round(4).tolist())
 
 
-def sum_of_squares(total: float, dof: float) -> float:
+def sum_of_squares(total: float, dof: float) -> Evidence:
     """Two-sided p value of a sum of squares that has the χ² distribution."""
-    return float(2 * min(stats.chi2.cdf(total, dof), stats.chi2.sf(total, dof)))
+    p = float(2 * min(stats.chi2.cdf(total, dof), stats.chi2.sf(total, dof)))
+    low, high = total / np.asarray(stats.chi2.ppf((0.975, 0.025), dof))
+    return Evidence(p, text=f"mean square {total / dof:.3g} ({low:.3g} to {high:.3g}), stated 1")

@@ -113,7 +113,9 @@ def _block(
         {
             "claim": row["name"].split(": ", 1)[1],
             "data sets": f"{row['trials']}",
-            "measured (95 % Monte-Carlo interval)": "; ".join(map(_measured, row["shares"])) or "–",
+            "measured (95 % Monte-Carlo interval)": "; ".join(
+                [*map(_measured, row["shares"]), *filter(None, [row["text"]])]
+            ),
             "p": f"{row['p']:.2g}",
             "rejected below": f"{level:.1g}",
             "p of the control": _probability(row["control"]),
