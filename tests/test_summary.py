@@ -129,8 +129,8 @@ def test_a_pool_is_no_kind() -> None:
     pooled = counted("held: all kinds", 0, 180, met=False)
     text = front_page.figure([*claims, pooled], "held: ", pool="all kinds")
     assert text == (
-        "held: 25.0 to 65.0 % of 9 kinds, least a (5 of 20); 0 not met; "
-        "all kinds, together: 0 of 180 **not met**"
+        "held: 25.0 to 65.0 % of 9 kinds, least a: 5 of 20, 8.7 to 49.1 % (95 %); 0 not met; "
+        "all kinds, together: 0 of 180, 0.0 to 2.0 % (95 %) **not met**"
     )
     with pytest.raises(ValueError, match="all kinds"):
         front_page.figure(claims, "held: ", pool="all kinds")

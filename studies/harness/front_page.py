@@ -240,8 +240,8 @@ def figure(claims: Sequence[Claim], begin: str, each: str = "kinds", pool: str =
     if len(own) > _MOST and len(shares) == len(own):
         worst = own[shares.index(min(shares))]
         text = (
-            f"{begin}: {percents(shares)} of {len(own)} {each}, least {rest[worst]} "
-            f"({_shown(worst)}); {sum(not claim.met for claim in own)} not met"
+            f"{begin}: {percents(shares)} of {len(own)} {each}, least {rest[worst]}: "
+            f"{_shown(worst)}; {sum(not claim.met for claim in own)} not met"
         )
         together = [f"; {rest[x]}, together: {_shown(x)}{_mark(x)}" for x in pooled]
         return text + "".join(together)
@@ -251,7 +251,7 @@ def figure(claims: Sequence[Claim], begin: str, each: str = "kinds", pool: str =
 
 def _shown(claim: Claim) -> str:
     """Return the figure of a claim with its interval, if it has one."""
-    return claim.figure + f" ({claim.interval})" * bool(claim.interval)
+    return ", ".join(filter(None, (claim.figure, claim.interval)))
 
 
 def _mark(claim: Claim) -> str:
