@@ -130,7 +130,7 @@ STATEMENTS = (
         ("health at the last log: 90 % intervals hold the truth",
          "remaining life: 90 % intervals hold the truth", "services at a risk",
          "machines that never reach a limit", "verdicts that are right",
-         "drawn machines without health", "nominal machines that alarm, life payload"),
+         "drawn machines without health", "nominal machines that alarm, life payload-not-logged"),
         "estimates with recorded covariances; importance sampling, not chains; health and life are "
         "judged also where the program withholds them, as of most machines whose modes are off the "
         "shipped description; of the 100 machines 81 fail",

@@ -23,7 +23,7 @@ from studies.harness.study import STUDIES
 
 # Peer, world, our figures and theirs, intervals that hold, time over ours, who is better in what.
 Row = tuple[str, str, str, str, str, float | None, dict[str, str]]
-LEVEL, SURE, SAME_TIME = 0.05, 2.0, 1.15
+LEVEL, SURE, SAME_TIME, SAME_SHARE = 0.05, 2.0, 1.15, 0.02
 OURS, PEER, SAME = "lmshealth", "**peer**", "equal"
 CONTROL = "peaks of single channels"
 HEAD = ("peer", "world", OURS, "the peer", "intervals that hold", "time over ours", "better")
@@ -163,9 +163,10 @@ def lives(record: Any) -> Iterator[Row]:
 
 
 def _nearer(held: Sequence[Sequence[int]], stated: float) -> str:
-    """Return whose intervals hold what they state, of ours and theirs that hold, of so many."""
-    ours, theirs = (float(low <= stated <= high) for low, high in starmap(clopper_pearson, held))
-    return _who(ours - theirs)
+    """Return whose share that holds, of ours and theirs of so many, is nearer to what is stated."""
+    ends = starmap(clopper_pearson, held)
+    ours, theirs = (max(low - stated, stated - high, 0.0) for low, high in ends)
+    return _who(theirs - ours, SAME_SHARE)
 
 
 def _who(gain: float, error: float = 0.0) -> str:

@@ -50,8 +50,10 @@ AS_GOOD, HOLD = "no peer has smaller errors in any kind", "90 % intervals hold i
 WORSE = "the last estimate is worse where nothing moves (control)"
 TOO_FEW = "half the width does not hold (control)"
 NOT_MET = {
-    AS_GOOD: "a machine that stays is tracked best by a filter that takes it to stay (local level), "
-    "whose intervals hold in no other kind"
+    AS_GOOD: (
+        "a machine that stays is tracked best by a filter that takes it to stay (local level), "
+        "whose intervals hold in no other kind"
+    )
 }
 
 # Ln f of the modes at the last log, and its standard deviation.
@@ -209,7 +211,7 @@ def claims(record: Row) -> Iterator[Claim]:
         yield Claim(
             f"root mean square error of ln f at the last log, {kind}",
             f"{number(ours['rms'])} of a log's; 90 % intervals hold {held['hits']} of {held['n']}",
-            f"{100 * held['low']:.1f} to {100 * held['high']:.1f} % (95 %)",
+            f"{100 * held['low']:.1f} to {100 * held['high']:.1f} % (99.9 %)",
             f"{beside}; half as wide {narrow['held']['hits']}",
             all(row["worse_by"][0] > -2 * row["worse_by"][1] for row in rows.values())
             and held["low"] <= 0.9 <= held["high"],
