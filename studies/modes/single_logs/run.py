@@ -194,6 +194,7 @@ def claims(record: Row) -> Iterator[Claim]:
             f"95 % intervals of f and ζ of single logs hold, {name}",
             f"{percents([ours['f']['share'], ours['zeta']['share']])} of {n}",
             f"± {100 * 1.96 * np.sqrt(0.95 * 0.05 / n):.1f} %",
+            f"at least {100 * LEAST:.0f} % required; "
             f"steady, white forces in phase assumed: {percents([control['f']['share']])} of f; "
             f"{span(one['wider'])} times as wide",
             record["passed"][f"95 % intervals hold 90 %, {name}"],
