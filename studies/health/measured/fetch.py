@@ -1,7 +1,7 @@
-"""Fetch recordings of the sets ``dropbear_ds8`` and ``shake_3storey`` into a folder.
+"""Fetch the recordings of ``dropbear_ds8``, ``shake_3storey`` and ``palisaden_building``.
 
-They stay where their authors published them, under CC BY-SA 4.0 and BSD-2; nothing of them is part
-of this project. ``git`` is needed, and some 100 MB.
+They stay where their authors published them, under CC BY-SA 4.0, BSD-2 and MIT; nothing of them is
+part of this project. ``git`` is needed, and some 130 MB.
 """
 
 import gzip
@@ -22,11 +22,17 @@ FRAME = (
     "4f0e831cae79a1c021bd4081e9d952c0f6f6e3b4",
     "notebooks/uploads/mini_shake_table/Flexible vs. Stiff",
 )
+# Test data of pyOMA2.
+BUILDING = (
+    "https://github.com/dagghe/pyOMA-test-data",
+    "f179b41267e21c6624db0a8eb0ef40cea38f9c39",
+    "test_data/palisaden",
+)
 
 
 def fetch(folder: Path) -> None:
     """Write the recordings under the names that studies read."""
-    for name in ("dropbear_ds8/open", "shake_3storey/open"):
+    for name in ("dropbear_ds8/open", "shake_3storey/open", "palisaden_building"):
         (folder / name).mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory() as scratch:
         for path in checked_out(*BEAM, f"{scratch}/beam").glob("test*.txt"):
@@ -37,6 +43,8 @@ def fetch(folder: Path) -> None:
             event = re.split(r"[()]", name)[1].replace(" ", "")
             target = folder / f"shake_3storey/open/{frame}_{event}_{floor}.csv"
             target.write_bytes(path.read_bytes())
+        building = checked_out(*BUILDING, f"{scratch}/building") / "Palisaden_dataset.npy"
+        (folder / "palisaden_building" / building.name).write_bytes(building.read_bytes())
 
 
 def checked_out(repository: str, commit: str, part: str, at: str) -> Path:

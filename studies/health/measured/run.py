@@ -14,8 +14,8 @@ Run time
     Twenty minutes of a busy processor.
 Data
     Folders ``dropbear_ds8``, ``shake_3storey`` and ``palisaden_building`` of LMSHEALTH_DATA;
-    ``python -m studies.health.measured.fetch`` names and fetches the further recordings of the
-    first two (11 repeats, 5 events), all of which the full form needs.
+    ``python -m studies.health.measured.fetch`` names and fetches them, with the further recordings
+    of the first two (11 repeats, 5 events), all of which the full form needs.
 """
 
 from __future__ import annotations
