@@ -12,6 +12,7 @@ from studies.harness import front_page, summary
 from studies.harness.claims import Claim, counted, covered
 from studies.harness.figures import draw, shown
 from studies.harness.study import Study
+from studies.track import drift
 
 
 @pytest.fixture
@@ -113,6 +114,19 @@ def test_what_failed_is_reported(copied: Path) -> None:
     path.write_text(json.dumps(record))
     expected = "Check not met: *coverage*: the noise was another one."
     assert expected in summary.group_page("modes")
+
+
+def test_a_reason_may_be_found_after_the_record(
+    copied: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The reasons that a study has now complete those of its record."""
+    path = copied / "track" / "drift.json"
+    record: dict[str, Any] = json.loads(path.read_text())
+    record["passed"][drift.FASTLY] = False
+    path.write_text(json.dumps(record))
+    assert f"Check not met: *{drift.FASTLY}*." in summary.group_page("track")
+    monkeypatch.setattr(drift, "NOT_MET", {drift.FASTLY: "errors are larger"}, raising=False)
+    assert f"Check not met: *{drift.FASTLY}*: errors are larger." in summary.group_page("track")
 
 
 def test_claims_are_judged() -> None:

@@ -70,6 +70,10 @@ def records(group: str) -> list[Record]:
             content = json.loads(record_of(script).read_text(encoding="utf-8"))
             parts = script.relative_to(HERE).with_suffix("").parts
             module = import_module(".".join(("studies", *parts)))
+            # Reasons of checks that are not met may be found after the record was made.
+            reasons = content.get("not_met", {})
+            if isinstance(reasons, dict):
+                content["not_met"] = {**reasons, **getattr(module, "NOT_MET", {})}
             found.append(Record(script, question, content, tuple(module.claims(content))))
         else:
             found.append(Record(script, question, None, ()))
