@@ -107,6 +107,18 @@ def test_records_of_other_code_are_not_fresh(tmp_path: Path) -> None:
     assert not full.is_fresh(script)
 
 
+def test_a_failed_check_with_a_reason_is_fresh(tmp_path: Path) -> None:
+    """The reason may be found after the record; a check without one is recorded again."""
+    script, record = tmp_path / "run.py", tmp_path / "result.json"
+    script.write_text("NOT_MET = {'asked': 'why'}\n\n\ndef main() -> None:\n    print(1)\n")
+    forget()
+    code = provenance.code_of_script(script, ())
+    for failed, fresh in ((["asked"], True), (["asked", "other"], False)):
+        made = {"code": code, "also": [], "failed": failed}
+        record.write_text(json.dumps({"recorded": made}))
+        assert full.is_fresh(script) == fresh
+
+
 def test_every_study_is_among_them(root: Path) -> None:
     """Every script that has claims is recorded by the command."""
     found = [path for path, _ in full.scripts(root / "studies", full.GROUPS)]

@@ -1,7 +1,7 @@
 """Record all studies in full, one after the other: ``make studies FULL=1``.
 
-A study whose record was made by the code that it has now, without a failed check, is not run again,
-and trials of an interrupted study are kept (`studies.harness.study`). A study that fails does not
+A study whose record was made by the code that it has now is not run again, unless a check failed
+for which the study has no reason (``NOT_MET``), and trials of an interrupted study are kept (`studies.harness.study`). A study that fails does not
 stop the others; the exit status is then 1. What studies print is in ``studies/.kept``.
 """
 
@@ -13,6 +13,7 @@ import sys
 import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
+from runpy import run_path
 
 from studies.harness.provenance import PROJECT, code_of_script
 from studies.harness.study import KEPT, record_of
@@ -30,15 +31,21 @@ def scripts(root: Path, groups: Sequence[str]) -> Iterator[tuple[Path, str]]:
 
 
 def is_fresh(script: Path) -> bool:
-    """Return whether a record without a failed check is of the code that its study has now."""
+    """Return whether a record, without a failed check that has no reason, is of today's code."""
     path = record_of(script)
     made = json.loads(path.read_text(encoding="utf-8"))["recorded"] if path.exists() else {}
     # Records of earlier versions have no digest.
     return (
         "code" in made
-        and not made["failed"]
+        and not unexplained(script, made["failed"])
         and made["code"] == code_of_script(script, made["also"])
     )
+
+
+def unexplained(script: Path, failed: Sequence[str]) -> set[str]:
+    """Return the failed checks of a record for which its study has no reason."""
+    # Most records have none: their studies are not imported.
+    return set(failed) - set(run_path(str(script)).get("NOT_MET", ())) if failed else set()
 
 
 def run_all(root: Path, groups: Sequence[str], kept: Path = KEPT) -> list[str]:
