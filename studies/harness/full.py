@@ -1,8 +1,9 @@
 """Record all studies in full, one after the other: ``make studies FULL=1``.
 
 A study whose record was made by the code that it has now is not run again, unless a check failed
-for which the study has no reason (``NOT_MET``), and trials of an interrupted study are kept (`studies.harness.study`). A study that fails does not
-stop the others; the exit status is then 1. What studies print is in ``studies/.kept``.
+for which the study has no reason (``NOT_MET``), and trials of an interrupted study are kept
+(`studies.harness.study`). A study that fails does not stop the others; the exit status is then 1.
+What studies print is in ``studies/.kept``.
 """
 
 from __future__ import annotations
