@@ -42,7 +42,15 @@ TASKS = [("a", k) for k in range(5)] + [("b", 0)]
 
 def forget() -> None:
     """Forget what was known of all code."""
-    for name in ("digest", "tree", "statements", "meaning", "definition"):
+    for name in (
+        "digest",
+        "tree",
+        "exists",
+        "file",
+        "statements",
+        "meaning",
+        "definition",
+    ):
         getattr(provenance, f"_{name}").cache_clear()
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import ast
-import copy
 import hashlib
 import os
 import platform
@@ -12,7 +11,8 @@ import subprocess
 import sys
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator
-from functools import cache, partial
+from dataclasses import dataclass
+from functools import cache, cached_property, partial
 from importlib import import_module
 from importlib.metadata import version
 from pathlib import Path
@@ -28,6 +28,22 @@ _HERE = Path(__file__).resolve()
 _Part = tuple[Path, str]
 _Origins = dict[str, tuple[str, _Part | None]]
 _Needs = dict[str, _Part]  # parts by the names that code has for them
+
+
+@dataclass(eq=False)
+class _Statement:
+    """The code of a statement, and the parts that it needs."""
+
+    code: str
+    needs: _Needs
+
+    @cached_property
+    def defined(self) -> str:
+        """Return the code with the definitions of the names in it."""
+        uses = (f"{name}={_definition(own)}" for name, own in self.needs.items())
+        return " ".join([self.code, *sorted(uses)])
+
+
 _ALL, _RUN = "*", ""
 _MAIN = ast.unparse(ast.parse('__name__ == "__main__"'))
 _PROGRAMS = ("lmshealth/cli/*.py", "models/__main__.py")
@@ -97,7 +113,7 @@ def _script(work: Callable[..., Any]) -> Path:
 
 @cache
 def _digest(path: Path, name: str, also: tuple[str, ...]) -> str:
-    files = (_file(module.split(".")) for module in also)
+    files = (_file(*module.split(".")) for module in also)
     needed = _needed({(path, name)} | {(file, _ALL) for file in files if file is not None})
     total = hashlib.sha256(" ".join(version(library) for library in _LIBRARIES).encode())
     code = "".join(sorted(set().union(*needed.values())))
@@ -148,13 +164,13 @@ def _needed(parts: set[_Part]) -> dict[Path, set[str]]:
     With each statement is what the names in it are.
     """
     found = dict[Path, set[str]]()
-    for module, code, needs in _reached(parts):
-        meanings = (f"{written}={_meaning(part)}" for written, part in needs.items())
-        found.setdefault(module, set()).add(" ".join([code, *sorted(meanings)]))
+    for module, statement in _reached(parts):
+        meanings = (f"{name}={_meaning(part)}" for name, part in statement.needs.items())
+        found.setdefault(module, set()).add(" ".join([statement.code, *sorted(meanings)]))
     return found
 
 
-def _reached(parts: set[_Part], *, imports: bool = True) -> Iterator[tuple[Path, str, _Needs]]:
+def _reached(parts: set[_Part], *, imports: bool = True) -> Iterator[tuple[Path, _Statement]]:
     """Yield the statements that parts of modules need, directly or not, each with its module.
 
     With imports what runs when the modules are imported is among them.
@@ -164,7 +180,7 @@ def _reached(parts: set[_Part], *, imports: bool = True) -> Iterator[tuple[Path,
         module, name = part = left.pop()
         # Names that the package gathers count in their own modules. This module records by which
         # code a value was computed, and computes none.
-        if part in seen or part == (_GATHERING, _RUN) or module == _HERE or not module.exists():
+        if part in seen or part == (_GATHERING, _RUN) or module == _HERE or not _exists(module):
             continue
         seen.add(part)
         if name in _WORDS:
@@ -172,10 +188,15 @@ def _reached(parts: set[_Part], *, imports: bool = True) -> Iterator[tuple[Path,
         if imports:
             # Whoever imports from a package runs all that it begins with, and what this imports.
             left += [(module.parent / "__init__.py", _RUN), (module, _RUN)]
-        for code, needs in _statements(module).get(name, ()):
-            left += needs.values()
-            if code:
-                yield module, code, needs
+        for statement in _statements(module).get(name, ()):
+            left += statement.needs.values()
+            if statement.code:
+                yield module, statement
+
+
+@cache
+def _exists(module: Path) -> bool:
+    return module.exists()
 
 
 @cache
@@ -183,10 +204,7 @@ def _meaning(part: _Part) -> str:
     """Return the digest of all code that a name depends on, wherever it is defined."""
     if part[1] in (_ALL, _RUN, *_WORDS):
         return ""
-    rows = {
-        " ".join([code, *sorted(f"{name}={_definition(own)}" for name, own in needs.items())])
-        for _, code, needs in _reached({part}, imports=False)
-    }
+    rows = {statement.defined for _, statement in _reached({part}, imports=False)}
     return hashlib.sha256("".join(sorted(rows)).encode()).hexdigest()[:16]
 
 
@@ -194,25 +212,25 @@ def _meaning(part: _Part) -> str:
 def _definition(part: _Part) -> str:
     """Return the digest of the definition of a name alone."""
     module, name = part
-    is_one = module.exists() and name not in (_ALL, _RUN, *_WORDS)
+    is_one = _exists(module) and name not in (_ALL, _RUN, *_WORDS)
     # A name that is imported is what its definition is.
     codes = sorted(
-        code or "".join(map(_definition, needs.values()))
-        for code, needs in (_statements(module).get(name, ()) if is_one else ())
+        one.code or "".join(map(_definition, one.needs.values()))
+        for one in (_statements(module).get(name, ()) if is_one else ())
     )
     return hashlib.sha256("".join(codes).encode()).hexdigest()[:16]
 
 
 @cache
-def _statements(module: Path) -> dict[str, list[tuple[str, _Needs]]]:
-    """Return the code of each name of a module, with the parts that it needs."""
-    found = defaultdict[str, list[tuple[str, _Needs]]](list)
+def _statements(module: Path) -> dict[str, list[_Statement]]:
+    """Return the statements of each name of a module."""
+    found = defaultdict[str, list[_Statement]](list)
     origins = _origins(_tree(module).body)
     for name, (code, part) in origins.items():
         for one in (name, _ALL):
-            found[one].append((code, {name: part} if part else {}))
+            found[one].append(_Statement(code, {name: part} if part else {}))
         # What a module registers when it is imported counts for whoever imports it.
-        found[_RUN].append(("", {name: (part[0], _RUN)} if part else {}))
+        found[_RUN].append(_Statement("", {name: (part[0], _RUN)} if part else {}))
     for statement in _tree(module).body:
         test = ast.unparse(statement.test) if isinstance(statement, ast.If) else ""
         if isinstance(statement, ast.Import | ast.ImportFrom) or test == _MAIN:
@@ -224,7 +242,7 @@ def _statements(module: Path) -> dict[str, list[tuple[str, _Needs]]]:
         # What a module makes of its own place or name is of that module.
         is_placed = uses.keys() & {"__file__", "__name__", "__package__"}
         place = f"{module.parent.name}/{module.name}" if is_placed else ""
-        row = _dump(statement) + place, uses
+        row = _Statement(_dump(statement) + place, uses)
         for name in {*names, _ALL}:
             found[name].append(row)
     return dict(found)
@@ -232,11 +250,18 @@ def _statements(module: Path) -> dict[str, list[tuple[str, _Needs]]]:
 
 def _dump(statement: ast.stmt) -> str:
     """Return the code of a statement, without the modules of the project that it names."""
-    statement = copy.deepcopy(statement)
-    for node in ast.walk(statement):
-        if isinstance(node, ast.ImportFrom) and (node.module or "").split(".")[0] in _PACKAGES:
-            node.module = None
-    return ast.dump(statement)
+    own = [
+        node
+        for node in ast.walk(statement)
+        if isinstance(node, ast.ImportFrom) and (node.module or "").split(".")[0] in _PACKAGES
+    ]
+    modules = [node.module for node in own]
+    for node in own:
+        node.module = None
+    code = ast.dump(statement)
+    for node, module in zip(own, modules, strict=True):
+        node.module = module
+    return code
 
 
 def _uses(module: Path, statement: ast.stmt, origins: _Origins) -> _Needs:
@@ -288,7 +313,7 @@ def _origins(nodes: Iterable[ast.AST]) -> _Origins:
     for node in nodes:
         if isinstance(node, ast.Import):
             for alias in node.names:
-                file = _file(alias.name.split("."))
+                file = _file(*alias.name.split("."))
                 part = (file, _ALL) if file else None
                 code = "" if part else ast.dump(alias)
                 found[alias.asname or alias.name.split(".")[0]] = code, part
@@ -303,12 +328,12 @@ def _origins(nodes: Iterable[ast.AST]) -> _Origins:
 
 def _source(package: list[str], name: str) -> _Part | None:
     """Return what a name is: a module of its own, or a name of one that has it or gathers it."""
-    if file := _file([*package, name]):
+    if file := _file(*package, name):
         return file, _ALL
-    path = _file(package)
+    path = _file(*package)
     if path == _GATHERING:
         home = getattr(getattr(import_module(package[0]), name, None), "__module__", package[0])
-        path = _file(home.split("."))
+        path = _file(*home.split("."))
     return (path, name) if path else None
 
 
@@ -318,7 +343,8 @@ def _words(file: Path) -> list[str]:
     return parts[:-1] if parts[-1] == "__init__" else parts
 
 
-def _file(parts: list[str]) -> Path | None:
+@cache
+def _file(*parts: str) -> Path | None:
     """Find a module of the project; None for others."""
     if parts[0] not in _PACKAGES:
         return None
