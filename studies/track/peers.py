@@ -70,7 +70,8 @@ def main() -> None:
     with study.pool() as pool:
         rows = study.trials.collect(one_life, tasks, pool=pool)
     found = {kind: compare([row for row in rows if row["kind"] == kind]) for kind in kinds}
-    study.conclude({"kinds": found, "passed": verdicts(found)}, not_met=NOT_MET)
+    answer = {"kinds": found, "passed": verdicts(found)}
+    study.conclude(answer, not_met=NOT_MET, quick_may_fail=True)
 
 
 def one_life(kind: str, seed: int) -> Row:
