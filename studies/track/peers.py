@@ -61,11 +61,11 @@ Answer = tuple[FloatArray, FloatArray]
 
 
 def main() -> None:
-    """Run the study; ``--quick`` does two lives of two kinds and records nothing."""
+    """Run the study; ``--quick`` does four lives of two kinds and records nothing."""
     study = Study(__file__, __doc__)
     if not study.quick and not all(map(find_spec, ("statsmodels", "simdkalman"))):
         raise SystemExit("statsmodels or simdkalman not installed: pip install '.[peers]'")
-    n, kinds = (2, ("quiet", OUTLIERS)) if study.quick else (LIVES, KINDS)
+    n, kinds = (4, ("quiet", OUTLIERS)) if study.quick else (LIVES, KINDS)
     tasks = [(kind, seed) for kind in kinds for seed in range(0, 2 * n, 2)]
     with study.pool() as pool:
         rows = study.trials.collect(one_life, tasks, pool=pool)
