@@ -1,8 +1,9 @@
 """How other programs search a band, with settings that a user can choose without the truth.
 
 The record is decimated to the lowest rate above 2.5 times the top of the band, displacements are
-differentiated twice and channels scaled to unit variance. Models reach order 40 (60 of pyOMA2 above
-four channels), with as many block rows as lags of a third of a second hold, 20 to 40 of them.
+differentiated twice and channels scaled to unit variance. SSI reaches order 40 (60 of pyOMA2 and
+koma above four channels), poly-reference LSCF 20, with as many block rows as lags of a third of a
+second hold, 20 to 40 of them, of pyOMA2 at least as many as the largest order needs.
 Everything else is the default of the program. Poles outside the band, or undamped, are discarded.
 Standard deviations are those that a program states with its estimates; pyOMA2 searches once more
 for them, as it then takes many times as long and drops uncertain poles.
@@ -63,7 +64,9 @@ def pyoma2(world: World, *, with_std: bool = False) -> dict[str, Found]:
     start = time.process_time()
     samples, rate = _prepare(world)
     order = 40 if samples.shape[1] <= 4 else 60
-    algorithm = SSI(name="ssi", br=_rows(rate), ordmax=order, calc_unc=with_std)
+    # A model of the largest order needs more rows than this.
+    rows = max(_rows(rate), order // samples.shape[1] + 1)
+    algorithm = SSI(name="ssi", br=rows, ordmax=order, calc_unc=with_std)
     setup = SingleSetup(samples, fs=rate)
     setup.add_algorithms(algorithm)
 
@@ -184,7 +187,8 @@ def _found(search: Callable[[], Sequence[Array]], band: tuple[float, float], sta
         warnings.simplefilter("ignore")
         logging.disable(logging.CRITICAL)
         try:
-            found = np.array(search(), dtype=float)
+            # A program may return a single mode without a dimension.
+            found = np.array([np.atleast_1d(one) for one in search()], dtype=float)
             values = np.full((4, found.shape[1]), np.nan)
             values[: len(found)] = found
         except Exception:  # of any kind: these are programs of others

@@ -14,7 +14,7 @@ Method
     intervals two thirds as wide must not cover; peaks of the spectra of single channels must miss
     modes.
 Run time
-    About half an hour on one processor. Needs the extra ``peers``.
+    About ten minutes on two processors. Needs the extra ``peers``.
 """
 
 from __future__ import annotations
@@ -82,7 +82,7 @@ def main() -> None:
         for name, own in seeds.items()
         for seed in own
     ]
-    with study.pool(1) as pool:
+    with study.pool() as pool:
         records = study.trials.collect(examine, tasks, pool=pool)
     families = {name: summarise([r for r in records if r["family"] == name]) for name in seeds}
     passed = verdicts(families)
