@@ -173,6 +173,8 @@ def section(record: Record, folder: Path) -> Iterator[str]:
     for name, fine in record.content.get("passed", {}).items():
         if not fine:
             why = f": {reasons[name]}" if isinstance(reasons, dict) and name in reasons else ""
+            if why and name in made.get("failed", ()):
+                why += " (found after the record)"
             yield from ("", f"Check not met: *{name}*{why}.")
 
 

@@ -1,16 +1,17 @@
 """Is ln f tracked as well, and stated as rightly, as by other filters that find their own noise?
 
 Method
-    Lives of three modes of `drift`, which knows nothing of the state space of the program, without
-    temperature: four courses of wear, quiet and wandering machines, and two courses with 5 % of
-    the logs (never the last) off by eight standard deviations, or with stated errors of half their
-    size. Every program gets ln f and its stated standard deviations, log by log, and is asked for
-    ln f without wander at the last log. Peers: statsmodels, local linear trend and local level,
+    Lives of three modes of `drift`, which are not drawn from a state space, without temperature:
+    four courses of wear, quiet and wandering machines, and linear wear with 5 % of the estimates
+    (of no first or last log) too high by eight standard deviations, or with stated errors of half
+    their size. Every program gets ln f and its stated standard deviations, log by log, and is asked
+    for ln f without wander at the last log. Peers: statsmodels, local linear trend and local level,
     variances by maximum likelihood for each mode; simdkalman, local linear trend, variances by 50
     steps of expectation maximisation; filterpy, local linear trend with the stated errors and a
     slope that changes by a twentieth of one from log to log, as its user would choose it. Errors
-    are in units of the true standard deviation of one log. Controls: the last estimate alone, which
-    must be worse, and intervals of the program half as wide, which must hold too little.
+    are in units of the true standard deviation of one log; modes are taken for independent.
+    Controls: the last estimate alone, which must be worse where nothing moves, and intervals of the
+    program half as wide, which must hold too little.
 Run time
     Six minutes on two processors. statsmodels and simdkalman come with the extra ``peers``.
 """
