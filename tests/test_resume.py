@@ -42,16 +42,9 @@ TASKS = [("a", k) for k in range(5)] + [("b", 0)]
 
 def forget() -> None:
     """Forget what was known of all code."""
-    for name in (
-        "digest",
-        "tree",
-        "exists",
-        "file",
-        "statements",
-        "meaning",
-        "definition",
-    ):
-        getattr(provenance, f"_{name}").cache_clear()
+    for one in vars(provenance).values():
+        if hasattr(one, "cache_clear"):
+            one.cache_clear()
 
 
 @pytest.fixture

@@ -20,8 +20,9 @@ from __future__ import annotations
 
 import time
 import warnings
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
+from functools import partial
 from importlib.util import find_spec
 
 import numpy as np
@@ -45,8 +46,9 @@ KINDS = ("linear", "power", "exponential", "late", "quiet", "wandering", OUTLIER
 LIVES, REACH = 40, stats.norm.ppf(0.95)
 SHARE_OFF, OFF_BY, FACTOR = 0.05, 8.0, 2.0
 STEPS, SLOPE = 50, 0.05
-# Level and its slope, from log to log.
+# Level and its slope, from log to log, in standard deviations of a log; variances at the first.
 TREND, SEEN = np.array([[1.0, 1.0], [0.0, 1.0]]), np.array([[1.0, 0.0]])
+FIRST = 1.0, 100.0
 AS_GOOD, HOLD = "no peer has smaller errors in any kind", "90 % intervals hold in every kind"
 WORSE = "the last estimate is worse where nothing moves (control)"
 TOO_FEW = "half the width does not hold (control)"
@@ -57,8 +59,9 @@ NOT_MET = {
     )
 }
 
-# Ln f of the modes at the last log, and its standard deviation.
+# Ln f of the modes at the last log, and its standard deviation; of one mode in its own units.
 Answer = tuple[FloatArray, FloatArray]
+Filter = Callable[[FloatArray], tuple[float, float]]
 
 
 def main() -> None:
@@ -79,7 +82,7 @@ def one_life(kind: str, seed: int) -> Row:
     """Return what each program makes of a life: errors and standard deviations, and its time."""
     base = kind.split(",")[0]
     life, rng = draw(base, seed), np.random.default_rng([seed, sum(kind.encode()), 1])
-    std = float(np.sqrt(life.history.cov[0, 0, 0]))
+    std = float(stated(life.history)[0])
     history = life.history
     if kind == OUTLIERS:
         off = rng.random(history.ln_frequency.shape) < SHARE_OFF
@@ -103,71 +106,66 @@ def by_lmshealth(history: History) -> Answer:
     return found.ln_frequency[-1], found.ln_frequency_std[-1]
 
 
-def by_filterpy(history: History) -> Answer:
+def mode_by_mode(one: Filter, history: History) -> Answer:
+    """Filter each mode alone, in its stated standard deviations from the first log on."""
+    noise = stated(history)
+    scaled = (history.ln_frequency - history.ln_frequency[0]) / noise
+    level, std = np.array([one(column) for column in scaled.T]).T
+    return history.ln_frequency[0] + noise * level, noise * std
+
+
+def by_filterpy(column: FloatArray) -> tuple[float, float]:
     """Filter with stated errors, and a slope that a user chose."""
-    levels, stds = [], []
-    for k, column in enumerate(history.ln_frequency.T):
-        noise = float(np.sqrt(history.cov[0, k, k]))
-        kalman = KalmanFilter(dim_x=2, dim_z=1)
-        kalman.x, kalman.P = np.array([column[0], 0.0]), np.diag([noise**2, (10 * noise) ** 2])
-        kalman.F, kalman.H = TREND, SEEN
-        kalman.R, kalman.Q = noise**2, Q_discrete_white_noise(2, 1.0, (SLOPE * noise) ** 2)
-        for value in column[1:]:
-            kalman.predict()
-            kalman.update(value)
-        levels.append(kalman.x[0])
-        stds.append(kalman.P[0, 0] ** 0.5)
-    return np.array(levels), np.array(stds)
+    kalman = KalmanFilter(dim_x=2, dim_z=1)
+    kalman.x, kalman.P = np.zeros(2), np.diag(FIRST)
+    kalman.F, kalman.H = TREND, SEEN
+    kalman.R, kalman.Q = 1.0, Q_discrete_white_noise(2, 1.0, SLOPE**2)
+    for value in column[1:]:
+        kalman.predict()
+        kalman.update(value)
+    return kalman.x[0], kalman.P[0, 0] ** 0.5
 
 
-def by_simdkalman(history: History) -> Answer:
+def by_simdkalman(column: FloatArray) -> tuple[float, float]:
     """Filter with variances by expectation maximisation."""
     import simdkalman
 
-    noise = np.sqrt(history.cov[0].diagonal()[: len(history.modes)])
-    levels, stds = [], []
-    for column, own in zip(history.ln_frequency.T, noise, strict=True):
-        scaled = ((column - column[0]) / own)[None]
-        kalman = simdkalman.KalmanFilter(TREND, np.diag([0.01, SLOPE**2]), SEEN, 1.0)
-        found = kalman.em(scaled, n_iter=STEPS).compute(
-            scaled, 0, initial_value=np.zeros(2), initial_covariance=np.diag([1.0, 100.0]),
-            filtered=True, smoothed=False,
-        ).filtered.states  # fmt: skip
-        levels.append(column[0] + own * found.mean[0, -1, 0])
-        stds.append(own * found.cov[0, -1, 0, 0] ** 0.5)
-    return np.array(levels), np.array(stds)
+    kalman = simdkalman.KalmanFilter(TREND, np.diag([0.01, SLOPE**2]), SEEN, 1.0)
+    states = kalman.em(column[None], n_iter=STEPS).compute(
+        column[None], 0, initial_value=np.zeros(2), initial_covariance=np.diag(FIRST),
+        filtered=True, smoothed=False,
+    ).filtered.states  # fmt: skip
+    return states.mean[0, -1, 0], states.cov[0, -1, 0, 0] ** 0.5
 
 
-def by_statsmodels(history: History, level: str) -> Answer:
+def by_statsmodels(level: str, column: FloatArray) -> tuple[float, float]:
     """Filter with variances by maximum likelihood."""
     from statsmodels.tsa.statespace.structural import UnobservedComponents
 
-    noise = np.sqrt(history.cov[0].diagonal()[: len(history.modes)])
-    levels, stds = [], []
-    for column, own in zip(history.ln_frequency.T, noise, strict=True):
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            model = UnobservedComponents((column - column[0]) / own, level=level)
-            found = model.fit(disp=0, maxiter=200)
-        levels.append(column[0] + own * found.filtered_state[0, -1])
-        stds.append(own * found.filtered_state_cov[0, 0, -1] ** 0.5)
-    return np.array(levels), np.array(stds)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        found = UnobservedComponents(column, level=level).fit(disp=0, maxiter=200)
+    return found.filtered_state[0, -1], found.filtered_state_cov[0, 0, -1] ** 0.5
+
+
+def stated(history: History) -> FloatArray:
+    """Return the stated standard deviations of ln f, which are those of all logs."""
+    return np.sqrt(history.cov[-1].diagonal()[: len(history.modes)])
 
 
 def last_estimate(history: History) -> Answer:
     """Take the last log as it is (control)."""
-    n = len(history.modes)
-    return history.ln_frequency[-1], np.sqrt(history.cov[-1].diagonal()[:n])
+    return history.ln_frequency[-1], stated(history)
 
 
-PROGRAMS = {
+PROGRAMS: dict[str, Callable[[History], Answer]] = {
     OURS: by_lmshealth,
-    "filterpy": by_filterpy,
-    "simdkalman": by_simdkalman,
-    "statsmodels, local linear trend": lambda history: by_statsmodels(history, "lltrend"),
-    "statsmodels, local level": lambda history: by_statsmodels(history, "llevel"),
+    "filterpy": partial(mode_by_mode, by_filterpy),
+    "simdkalman": partial(mode_by_mode, by_simdkalman),
+    "statsmodels, local linear trend": partial(mode_by_mode, partial(by_statsmodels, "lltrend")),
+    "statsmodels, local level": partial(mode_by_mode, partial(by_statsmodels, "llevel")),
     CONTROL: last_estimate,
-}  # fmt: skip
+}
 
 
 def compare(rows: list[Row]) -> Row:

@@ -90,8 +90,7 @@ NOT_MET = {
                     "preload, linear, a sudden loss", "preload, linear, common wander")},
 }  # fmt: skip
 # Checks that a claim of health (after the name of the parameter), verdicts or life stands for.
-HELD = ("is published", "is held", "is held by not too many")
-PRECISE = ("has no bias", "is narrow")
+OF_HEALTH = ("is published", "is held", "has no bias", "is held by not too many")
 OF_VERDICTS = ("the mode is named", "the part is named", "no part is surely degraded", "no alarm")
 
 
@@ -217,22 +216,22 @@ def claims(answered: Row) -> Iterator[Claim]:
         stays = "machines that stay, mostly with all draws at the baseline: " * (kind in HEALTHY)
         for name in (name for name in names if name in row["health"]):
             own, which = row["health"][name], f"{kind}, {name.replace('_', ' ')}"
+            mean, error = own["bias"]
             yield counted(
                 f"{stays}90 % intervals hold: {which}",
                 own["held_90"]["hits"],
                 own["n"],
-                f"50 %: {_share(own['held_50'])}; "
-                f"{NARROW} of the width: {_share(own['held_90_narrow'])}",
-                met=fine(*(f"{name} {what}" for what in HELD)),
+                f"50 %: {_share(own['held_50'])}; bias of ln {mean:+.4f} ± {error:.4f}, rms "
+                f"{number(own['rms'])}; {NARROW} of the width: {_share(own['held_90_narrow'])}",
+                met=fine(*(f"{name} {what}" for what in OF_HEALTH)),
             )
             if own["width_over_ideal"]:
-                mean, error = own["bias"]
                 yield Claim(
                     f"width over that of an estimator that knows the course: {which}",
                     number(own["width_over_ideal"]),
                     f"which holds {_share(own['ideal_held_90'])}",
-                    f"bias of ln {mean:+.4f} ± {error:.4f}, rms {number(own['rms'])}",
-                    fine(*(f"{name} {what}" for what in PRECISE)),
+                    f"{WIDTH:g} required" if f"{kind}: {name} is narrow" in passed else "",
+                    fine(f"{name} is narrow"),
                 )
         if right := row["right"]:
             counts = ", ".join(f"{word} {n}" for word, n in sorted(row["verdicts"].items()))

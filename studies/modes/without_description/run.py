@@ -154,28 +154,26 @@ def match(world: World, f: np.ndarray) -> tuple[list[tuple[int, int]], list[int]
 
 def summarise(records: list[Row]) -> Row:
     """Summarise the records of a family."""
-    scores = {q: column(records, "scores", q) for q in QUANTITIES}
+    scores = {q: known(column(records, "scores", q)) for q in QUANTITIES}
     names = dict.fromkeys(name for r in records for name in r["others"])
     others = {}
     for name in names:
         own = [r for r in records if name in r["others"]]
         rows = [r["others"][name] for r in own]
         pairs = {q: (column(own, "errors", q), column(rows, "errors", q)) for q in QUANTITIES}
-        stated = {q: column(rows, "scores", q) for q in QUANTITIES}
+        stated = {q: known(column(rows, "scores", q)) for q in QUANTITIES}
         others[name] = {
             **totals([{**r, **row} for r, row in zip(own, rows, strict=True)]),
             "time_over_ours": float(np.median([row["time_over_ours"] for row in rows])),
             "errors": {q: both(*pair) for q, pair in pairs.items()},
-            "coverage": {q: judge_scores(z[np.isfinite(z)]) for q, z in stated.items()
-                         if np.isfinite(z).any()},
+            "coverage": {q: judge_scores(z) for q, z in stated.items() if z.size},
         }  # fmt: skip
     return {
         **totals(records),
         "wandering": int(sum(r["wandering"] for r in records)),
-        "coverage": {q: judge_scores(z[np.isfinite(z)]) for q, z in scores.items()},
-        "control_narrower": {q: judge_scores(NARROWER * z[np.isfinite(z)])
-                             for q, z in scores.items()},
-        "largest_score_f": float(np.nanmax(np.abs(scores["f"]))),
+        "coverage": {q: judge_scores(z) for q, z in scores.items()},
+        "control_narrower": {q: judge_scores(NARROWER * z) for q, z in scores.items()},
+        "largest_score_f": float(np.abs(scores["f"]).max()),
         "seconds": float(np.median([r["seconds"] for r in records])),
         "imperfect": [{key: r[key] for key in ("seed", "channels", "missed_hz", "false_hz")}
                       for r in records if r["missed_hz"] or r["false_hz"]],
@@ -186,6 +184,11 @@ def summarise(records: list[Row]) -> Row:
 def column(rows: Sequence[Row], key: str, quantity: str) -> FloatArray:
     """Return the values of all modes of all records, nan where a mode was missed."""
     return np.array([x for row in rows for x in row[key][quantity]], dtype=float)
+
+
+def known(values: FloatArray) -> FloatArray:
+    """Return the values of the modes that were found."""
+    return values[np.isfinite(values)]
 
 
 def both(ours: FloatArray, theirs: FloatArray) -> Row:
